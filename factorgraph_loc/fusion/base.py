@@ -10,7 +10,7 @@ from factorgraph_loc.model.trajectory import Trajectory
 
 
 class _Every:
-    """A container that contains every string."""
+    """A container that contains every string: ``x in _Every()`` is always true."""
 
     def __contains__(self, modality: object) -> bool:
         return True
@@ -20,13 +20,15 @@ EVERY: Container[str] = _Every()  # the modalities of an estimator that accepts 
 
 
 class Estimator(Protocol):
-    """An estimator of the robot's pose. It processes measurements in the order of arrival, and returns estimates at any time.
+    """An estimator of the robot's pose. It processes measurements in the order of arrival, and returns estimates at any
+    time.
 
-    A class has the attribute ``causal = False`` if its estimates are useful only after the last measurement. It has
-    ``smoothed = False`` if its final trajectory equals the estimates during the run.
+    ``diagnostics``: counts and consistency statistics of the run. A class has the attribute ``causal = False`` if its
+    estimates are useful only after the last measurement. It has ``smoothed = False`` if its final trajectory equals the
+    estimates during the run.
 
-    Only :meth:`initialize`, :meth:`process` and ``forget`` change an estimator. Requests for results never change later
-    results, not even their rounding errors.
+    Only :meth:`initialize`, :meth:`process` and ``forget`` change the estimated values. Calls of other methods never
+    change later results.
     """
 
     diagnostics: Diagnostics
@@ -34,35 +36,37 @@ class Estimator(Protocol):
     def initialize(self, prior: PosePrior) -> None:
         """Start from a Gaussian prior of the pose. Before this call every estimate is ``unlocalized``.
 
-        Odometry from before the start may arrive before or after this call, but not after the first measurement of
-        another sensor. A prior without a heading is allowed if :func:`finds_heading` is true for the estimator. Then no
-        estimate is ``localized`` before the measurements determine the heading.
+        Odometry from before the time of the prior may arrive before or after this call, but not after the first
+        measurement of another sensor. A prior without a heading is allowed if :func:`finds_heading` is true for the
+        estimator. Then no estimate has the status ``localized`` before the measurements determine the heading.
         """
 
     def process(self, measurement: Measurement) -> None:
         """Process one measurement. A measurement that is late by more than the setting ``max_delay`` is counted and ignored."""
 
     def estimate(self, t: float | None = None) -> PoseEstimate:
-        """Return the pose at the time of the newest measurement, from all measurements so far. If ``t`` [s] is later,
-        the pose is predicted to ``t`` by odometry."""
+        """Return the pose at the time of the newest measurement, estimated from all measurements so far. If ``t`` [s]
+        is later, the pose is predicted to ``t`` by odometry."""
 
     def belief(self, t: float | None = None) -> Belief:
-        """Return the whole probability distribution of the pose, at the time of :meth:`estimate`. It has Gaussian
-        modes, and particles if the estimator uses them."""
+        """Return the probability distribution of the pose, at the same time as :meth:`estimate` with the same ``t``
+        [s]. It has Gaussian modes, and particles if the estimator uses them."""
 
     def learnt(self) -> Learnt:
         """Return the estimates of sensor constants and landmarks from all measurements."""
 
     def trajectory(self) -> Trajectory:
-        """Return the best estimate of all past poses with covariances, at the times at which a run records the pose."""
+        """Return the best estimates of all past poses with covariances, at the times at which the run recorded the
+        pose."""
 
 
 @runtime_checkable
 class ConcludingEstimator(Protocol):
-    """An estimator that computes its final trajectory separately, after the last measurement. This may add diagnostics."""
+    """An estimator that computes its final trajectory separately, after the last measurement. This computation may add
+    diagnostics."""
 
     def final_diagnostics(self) -> Diagnostics:
-        """Return the diagnostics of the run and of the final solution."""
+        """Return the diagnostics of the run, including those of the final trajectory."""
 
 
 @runtime_checkable
@@ -75,14 +79,16 @@ class ForgettingEstimator(Protocol):
 
 @runtime_checkable
 class RecordingEstimator(Protocol):
-    """An estimator that processes several ticks by one call, which is faster than one call per tick."""
+    """An estimator that can predict the pose to several times by one call, which is faster than one call per time."""
 
     def record(self, ticks: Sequence[float]) -> list[PoseEstimate]:
-        """Process ``ticks``, successive times [s] at which a run records the pose. Returns the estimate at each of them."""
+        """Return one estimate for each of ``ticks``, increasing times [s] at which a run records the pose. The
+        estimator processes these times like measurements."""
 
 
 def record_each(estimator: Estimator, ticks: Sequence[float]) -> list[PoseEstimate]:
-    """Process the ``ticks`` [s] one by one. Returns the estimate at each of them, from before it was processed."""
+    """Return the estimate at each of the times ``ticks`` [s]. Each time is then processed by the estimator, like a
+    measurement."""
     estimates = []
     for t in ticks:
         estimates.append(estimator.estimate(t))
@@ -91,7 +97,7 @@ def record_each(estimator: Estimator, ticks: Sequence[float]) -> list[PoseEstima
 
 
 def finds_heading(estimator: Estimator) -> bool:
-    """True if the estimator can start at a known position with an unknown heading. This includes estimators that can
-    start at an unknown position."""
+    """Return True if the estimator can start at a known position with an unknown heading. This includes estimators that
+    can start at an unknown position."""
     names = ("supports_unknown_start", "supports_unknown_heading")
     return any(getattr(estimator, name, False) for name in names)

@@ -35,11 +35,12 @@ Steps = Generator[float, None, T]  # a computation in steps. It yields the compu
 
 @dataclass(frozen=True)
 class Cloud:
-    """N weighted particles at one time.
+    """N weighted particles (poses and sensor constants) at one time.
 
-    ``poses`` (N, 3). ``constants`` (N, P): each particle's estimated constants of odometry and sensors.
-    ``log_weights`` (N,): normalised. ``localized``: True if there is only one mode. ``parts``: for each sensor by name,
-    the columns of its constants in ``constants``. ``odometry``: the integrated odometry at the time of the particles.
+    ``poses`` (N, 3): x, y [m], heading [rad]. ``constants`` (N, P): each particle's estimated constants of odometry and
+    sensors. ``log_weights`` (N,): normalised. ``localized``: True if there is only one mode. ``parts``: for each sensor
+    by name, the columns of its constants in ``constants``. ``odometry``: the integrated odometry at the time of the
+    particles.
     """
 
     poses: Array
@@ -55,51 +56,51 @@ class Cloud:
 
     @cached_property
     def moments(self) -> tuple[Array, Array]:
-        """The mean (3,) and covariance (3, 3) of the poses in the world frame."""
+        """The weighted mean (3,) and covariance (3, 3) of the poses (x, y, heading) in the world frame."""
         return pose_moments(self.poses, self.weights)
 
     @cached_property
     def joint(self) -> tuple[Array, Array]:
-        """The mean (P,) of the constants, and the covariance (3+P, 3+P) of the pose's body-frame perturbation and the constants."""
+        """The mean (P,) of the constants, and the joint covariance (3+P, 3+P) of pose and constants. The pose's error
+        is a perturbation in the body frame."""
         _, mean, covariance = self._errors()
         return mean[3:], covariance
 
     def _errors(self) -> tuple[Array, Array, Array]:
-        """The values (N, 3+P) of the particles: body-frame perturbations from the mean pose, and constants. Also their
-        mean (3+P,) and covariance (3+P, 3+P)."""
+        """Return values (N, 3+P) of the particles: body-frame perturbations from the mean pose, and constants. Also
+        returns their mean (3+P,) and covariance (3+P, 3+P)."""
         errors = np.concatenate((se2.twists_to(self.moments[0], self.poses), self.constants), axis=1)
         return errors, *vector_moments(errors, self.weights)
 
     def with_block(self, name: str, mean: Array, covariance: Array, rng: np.random.Generator) -> Cloud:
-        """Return the cloud with a block ``name`` of constants added, drawn from a Gaussian. ``mean`` (d,),
-        ``covariance`` (d, d): of the Gaussian."""
+        """Return the particles with ``d`` more constants. Each particle's values are drawn from a Gaussian with
+        ``mean`` (d,) and ``covariance`` (d, d). ``name``: the name of the sensor."""
         first = self.constants.shape[1]
         drawn = mean + positive.draws(covariance, len(self.poses), rng)
         parts = {**self.parts, name: slice(first, first + len(mean))}
         return replace(self, constants=np.concatenate((self.constants, drawn), axis=1), parts=parts)
 
     def weighed(self, likelihood: Array, share: float) -> tuple[Cloud, float]:
-        """Return the cloud with the weights multiplied by a likelihood to the power of ``share``. Also returns the
-        logarithm of the weighted mean of this power. ``likelihood`` (N,): the log-likelihood of each particle."""
+        """Return the particles with each weight multiplied by its likelihood to the power of ``share``. Also returns
+        the logarithm of the weighted mean of these powers. ``likelihood`` (N,): the log-likelihood of each particle."""
         weighed = self.log_weights + share * likelihood
         log_weights = normalised(weighed)
         heaviest = int(np.argmax(weighed))
         return replace(self, log_weights=log_weights), float(weighed[heaviest] - log_weights[heaviest])
 
     def thinned(self, count: int) -> Cloud:
-        """Return the cloud with only every k-th particle, so that about ``count`` particles remain."""
+        """Return only every k-th particle, so that about ``count`` particles remain. Their weights are normalised."""
         some = slice(None, None, max(1, len(self.poses) // count))
         weights = normalised(self.log_weights[some])
         return replace(self, poses=self.poses[some], constants=self.constants[some], log_weights=weights)
 
     def density(self) -> tuple[Cloud, Array]:
-        """Return a kernel density with the same moments as the particles.
+        """Return a kernel density with the same moments as the particles: kernel centres, and the covariance of the
+        kernel.
 
-        The poses are shrunk towards their mean, and each gets a Gaussian kernel (Liu, West, in "Sequential Monte Carlo
-        Methods in Practice", 2001, eq. 10.3.8). The sensor constants are a Gaussian given the pose.
-
-        Returns the shrunk cloud, and the covariance (3+P, 3+P) of the kernel for the pose's body-frame perturbation and
-        the constants. If the cloud has several modes, the poses are not shrunk and have a kernel of width zero.
+        The centres are the particles, moved towards their mean (Liu, West, in "Sequential Monte Carlo Methods in
+        Practice", 2001, eq. 10.3.8). The covariance (3+P, 3+P) is that of the pose's body-frame perturbation and the
+        constants. If there are several modes, the poses are not moved and their part of the covariance is zero.
         """
         weights = self.weights
         middle, _ = self.moments
@@ -127,8 +128,8 @@ class Cloud:
         return cloud, kernel + _inflated(covariance - explained, lost)
 
     def drawn(self, rows: NDArray[np.int64], kernel: Array, rng: np.random.Generator) -> Cloud:
-        """Draw particles of equal weight from a kernel density. ``rows`` (M,): the indices of the particles to draw
-        around. ``kernel`` (3+P, 3+P): the covariance of the kernel."""
+        """Return M particles of equal weight, drawn from a kernel density. ``rows`` (M,): the index of the kernel
+        centre of each new particle. ``kernel`` (3+P, 3+P): the covariance of the Gaussian kernel."""
         noise = positive.draws(kernel, len(rows), rng)
         return replace(
             self,
@@ -138,7 +139,8 @@ class Cloud:
         )
 
     def modes(self) -> tuple[Mode, ...]:
-        """Return the modes, in order of decreasing weight, each with the moments of the particles around its centre."""
+        """Return the modes, in order of decreasing weight. Each has the weight, mean and covariance of the particles
+        around its centre."""
         weights = self.weights
         modes: list[Mode] = []
         _, which = np.unique(cell_numbers(self.poses, CELL), return_inverse=True)
@@ -155,8 +157,8 @@ class Cloud:
 
 
 class Corrected(NamedTuple):
-    """A ``cloud`` after a correction by a likelihood. ``evidence``: the logarithm of the likelihood's mean over the
-    particles. ``left``: the sum of the exponents that are not yet applied, see :func:`corrected`."""
+    """Particles after a correction by a likelihood. ``evidence``: the logarithm of the likelihood's mean over the
+    particles. ``left``: the part of the exponent 1 of the likelihood that is not yet applied, see :func:`corrected`."""
 
     cloud: Cloud
     evidence: float
@@ -177,16 +179,16 @@ def corrected(
     """Correct particles by a likelihood in several steps (Musso, Oudjane, Le Gland, in "Sequential Monte Carlo Methods
     in Practice", 2001, section 12.4).
 
-    Each step multiplies the weights by a power of the likelihood, then resamples. The exponents have the sum 1. Each
-    exponent is the largest that keeps enough effective particles.
+    Each step multiplies the weights by a power of the likelihood, then resamples. The exponents have the sum ``left``.
+    Each exponent is the largest that keeps enough effective particles.
 
     ``likelihood(cloud)``: computes the log-likelihood (N,) of the measurement. ``resampled(cloud)``: computes a
     resampled cloud. ``enough(cloud)``: returns the minimum effective number of particles after a step. ``t`` [s]: the
-    time of the measurement.
-    ``below``: after the last step, particles are resampled only if the effective number is below this fraction of N.
-    ``left``: the sum of the exponents to apply. ``to_end``: False to omit the last step.
+    time of the measurement, for errors. ``below``: after the last step, particles are resampled only if the effective
+    number is below this fraction of N. ``to_end``: False to omit the last step.
 
-    Raises RunFailedError if no particle with a nonzero weight has a finite log-likelihood.
+    Returns a generator, which yields the computing cost of each part and returns a :class:`Corrected`. Raises
+    RunFailedError if no particle with a nonzero weight has a finite log-likelihood.
     """
     evidence = 0.0
     while left > 0.0:
@@ -202,7 +204,8 @@ def corrected(
 
 
 def in_one_step(function: Callable[[Cloud], T]) -> Callable[[Cloud], Steps[T]]:
-    """Wrap a function of particles as a generator :data:`Steps` with one step, which yields the computing cost 0."""
+    """Convert a function of particles to a function that returns a generator. The generator yields the computing cost 0
+    once, then returns the function's value."""
 
     def steps(cloud: Cloud) -> Steps[T]:
         yield 0.0
@@ -212,7 +215,7 @@ def in_one_step(function: Callable[[Cloud], T]) -> Callable[[Cloud], Steps[T]]:
 
 
 def finished(steps: Steps[T]) -> T:
-    """Run a generator :data:`Steps` to its end and return the result of the computation."""
+    """Run a generator to its end. Returns the value of its ``return`` statement."""
     while True:
         try:
             next(steps)
@@ -222,8 +225,8 @@ def finished(steps: Steps[T]) -> T:
 
 
 def systematic(weights: Array, rng: np.random.Generator, count: int | None = None) -> NDArray[np.int64]:
-    """Draw ``count`` indices with probabilities proportional to ``weights`` (N,), by systematic resampling (Kitagawa,
-    1996). The default count is N."""
+    """Return ``count`` random indices with probabilities proportional to ``weights`` (N,), by systematic resampling
+    (Kitagawa, 1996). The default of ``count`` is N."""
     count = len(weights) if count is None else count
     positions = (rng.random() + np.arange(count)) / count
     cumulative = np.cumsum(weights)
@@ -231,14 +234,15 @@ def systematic(weights: Array, rng: np.random.Generator, count: int | None = Non
 
 
 def around(poses: Array, middle: Array) -> NDArray[np.bool_]:
-    """Return a mask (N,) of the poses (N, 3) that belong to a mode with the centre ``middle`` (3,)."""
+    """Return a mask (N,) of the poses (N, 3) that are near the pose ``middle`` (3,), the centre of a mode."""
     difference = np.abs(poses - middle)
     difference[:, 2] = np.abs(se2.wrap(difference[:, 2]))
     return np.asarray(np.all(difference < REACH, axis=1))
 
 
 def cell_numbers(poses: Array, cell: Array) -> NDArray[np.int64]:
-    """Return for each of N poses (N, 3) the integer of its grid cell. ``cell`` (3,): the size of a cell [m, m, rad]."""
+    """Return an integer (N,) for each of N poses (N, 3). Poses in the same grid cell have equal integers. ``cell``
+    (3,): the size of a cell [m, m, rad]."""
     places = np.floor(poses / cell).astype(np.int64)
     places -= places.min(axis=0)
     size = places.max(axis=0) + 1
@@ -246,8 +250,8 @@ def cell_numbers(poses: Array, cell: Array) -> NDArray[np.int64]:
 
 
 def largest_share(log_weights: Array, likelihood: Array, left: float, enough: float) -> float:
-    """Return the largest exponent of a likelihood, at most ``left``, after which the effective number of particles is
-    still ``enough``.
+    """Return the largest exponent of a likelihood, at most ``left``, that keeps an effective number of at least
+    ``enough`` particles.
 
     ``log_weights`` (N,): the particles' log-weights. ``likelihood`` (N,): their log-likelihoods. The result is at least
     :data:`LEAST`, so that a correction has at most a few hundred steps.
@@ -268,9 +272,10 @@ def largest_share(log_weights: Array, likelihood: Array, left: float, enough: fl
 
 
 def weighable(likelihood: Array, log_weights: Array, t: float) -> Array:
-    """Return a log-likelihood (N,) with ``-inf`` instead of values that are not finite, so that these weigh nothing.
+    """Return a log-likelihood (N,) with ``-inf`` instead of values that are not finite, so that these particles get the
+    weight 0.
 
-    ``log_weights`` (N,): the particles' log-weights. ``t`` [s]: the time of the measurement. Raises
+    ``log_weights`` (N,): the particles' log-weights. ``t`` [s]: the time of the measurement, for errors. Raises
     RunFailedError if no particle with a nonzero weight has a finite log-likelihood.
     """
     possible = np.isfinite(likelihood)
@@ -282,7 +287,8 @@ def weighable(likelihood: Array, log_weights: Array, t: float) -> Array:
 
 
 def effective_size(log_weights: Array) -> float:
-    """Return the effective number of particles with normalised log-weights (N,) (Kong, Liu, Wong, 1994)."""
+    """Return the effective number of particles, the inverse of the sum of squared weights (Kong, Liu, Wong, 1994).
+    ``log_weights`` (N,): normalised."""
     return float(1.0 / np.sum(np.exp(2.0 * log_weights)))
 
 
@@ -293,7 +299,7 @@ def normalised(log_weights: Array) -> Array:
 
 
 def silverman(count: int, size: int) -> float:
-    """Return the bandwidth of Gaussian kernels for ``count`` points in ``size`` dimensions. The unit is the points'
+    """Return the bandwidth of Gaussian kernels for ``count`` points in ``size`` dimensions, relative to the points'
     standard deviation. Source: Silverman, "Density Estimation for Statistics and Data Analysis", 1986, eq. 4.14."""
     return float((4.0 / ((size + 2) * count)) ** (1.0 / (size + 4)))
 

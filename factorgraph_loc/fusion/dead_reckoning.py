@@ -28,14 +28,14 @@ class _PoseRecord(NamedTuple):
 
 
 class DeadReckoning(Filter):
-    """An estimator that uses only odometry. Its covariance grows with the distance."""
+    """An estimator that uses only odometry. Its covariance grows with the distance travelled."""
 
     modalities = frozenset[str]()
     smoothed = False
     _state: tuple[Array, Array]  # pose (3,), and its body-frame covariance (3, 3)
 
     def trajectory(self) -> Trajectory:
-        """Return the trajectory of the causal estimates, which no later measurement can improve."""
+        """Return the recorded estimates. No later measurement can improve them."""
         records: list[_PoseRecord] = self._records
         return at_ticks(
             self._ticks,

@@ -57,8 +57,9 @@ class EkfSettings(FilterSettings):
 
 
 class _State(NamedTuple):
-    """The state of the filter. ``pose`` (3,). ``rest`` (R,): the values of sensor constants and landmarks, in blocks.
-    ``covariance`` (3+R, 3+R): the covariance of the error state. ``layout``: the order of the blocks."""
+    """The state of the filter. ``pose`` (3,). ``rest`` (R,): the values of sensor constants and landmarks.
+    ``covariance`` (3+R, 3+R): of the error state, the pose's body-frame perturbation and ``rest``. ``layout``: the
+    names of the parts of ``rest``."""
 
     pose: Array
     rest: Array
@@ -70,7 +71,7 @@ class _State(NamedTuple):
         return _State(se2.moved(self.pose, delta), self.rest + delta[POSE:], covariance, self.layout)
 
     def first(self, size: int) -> _State:
-        """Return the state without the blocks after the first ``size`` components of the error state."""
+        """Return the state with only the first ``size`` components of the error state."""
         if size == len(self.covariance):
             return self
         return self._replace(rest=self.rest[: size - POSE], covariance=self.covariance[:size, :size])
@@ -83,7 +84,7 @@ class _State(NamedTuple):
         return observation.on_pose({name: values[name] for name in spreads}, spreads)
 
     def with_block(self, new: NewVariable) -> _State:
-        """Return the state with the variable ``new``, such as a landmark, added with its correlations."""
+        """Return the state with the variable ``new``, such as a landmark, added at the end, with its correlations."""
         size, columns = len(self.covariance), self.layout.columns
         cross, own = new.joint(self.covariance, columns)
         end = size + len(new.mean)
@@ -95,8 +96,9 @@ class _State(NamedTuple):
 
 
 class _Step(NamedTuple):
-    """A prediction step that the smoother reads. ``pose`` (3,): the predicted pose. ``transition`` (3, 3+R): the pose's
-    rows of the transition matrix; other rows equal an identity matrix. ``noise`` (3, 3): the pose's added covariance."""
+    """The data of a prediction step that the final smoother needs. ``pose`` (3,): the predicted pose. ``transition``
+    (3, 3+R): the pose's rows of the transition matrix; other rows equal an identity matrix. ``noise`` (3, 3): the
+    covariance added to the pose."""
 
     pose: Array
     transition: Array
@@ -161,7 +163,8 @@ class Ekf(Filter):
         self._step: _Step | None = None
 
     def initialize(self, prior: PosePrior) -> None:
-        """Start from a Gaussian prior of the pose. If the prior has no heading, the filter starts when the search has found one."""
+        """Start from a Gaussian prior of the pose. If the prior has no heading, the filter starts when measurements
+        have determined the heading."""
         if prior.has_heading:
             super().initialize(prior)
             return
@@ -179,7 +182,7 @@ class Ekf(Filter):
         return PosePrior(t, pose, covariance)
 
     def learnt(self) -> Learnt:
-        """Return the estimated constants and landmarks."""
+        """Return the estimated sensor constants and landmarks, with standard deviations or covariances."""
         if self._state is None:
             return Learnt()
         values, view = self._state.layout.values(self._state.rest), _View(self)
@@ -188,7 +191,8 @@ class Ekf(Filter):
         )
 
     def trajectory(self) -> Trajectory:
-        """Return the smoothed poses (Rauch, Tung, Striebel, 1965), or the causal poses if ``smooth`` is false."""
+        """Return the poses at all recorded times, smoothed backwards (Rauch, Tung, Striebel, 1965). They are not
+        smoothed if the setting ``smooth`` is false. The trajectory is empty if the start pose was never found."""
         records: list[_Record] = self._records
         if not records:  # the unknown start pose was never found
             return Trajectory(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3)))
@@ -215,7 +219,7 @@ class Ekf(Filter):
         return _State(np.array(prior.pose, dtype=float), np.zeros(len(sigmas)), covariance, Layout.of(self._constants))
 
     def record(self, ticks: Sequence[float]) -> list[PoseEstimate]:
-        """Process ``ticks``, times [s] at which a run records the pose. Returns the estimate at each of them."""
+        """Return one estimate for each of ``ticks``, increasing times [s] at which a run records the pose."""
         if self._begun == math.inf or ticks[0] <= self._t or self._search.waits:
             return record_each(self, ticks)
         self._anchor()
@@ -278,7 +282,7 @@ class Ekf(Filter):
 
     def _doubt(self, m: Measurement) -> None:
         """Check after the measurement ``m`` whether recent observations contradict the estimated poses. If they do,
-        continue at the pose that the search has found."""
+        continue at the pose that a global search has found."""
         view = _View(self)
         refuted = self._search.refuted(m, view.track, view.pose_back)
         best = self._search.best if refuted is not None else None
@@ -297,8 +301,8 @@ class Ekf(Filter):
         return self._start(self._search.brought(pose, self._odometry))
 
     def _jump(self, best: PosePrior, refuted: Refuted) -> None:
-        """Continue at the pose ``best``, without correlation with the rest of the state. The sensor constants are reset
-        to their estimates from before ``refuted.since``, when the estimated pose became wrong."""
+        """Continue at the pose ``best``, without correlation with other variables. The sensor constants are reset to
+        their estimates from before ``refuted.since``, when the estimated pose became wrong."""
         self._search.begin_track(by_search=True)
         for sensor in self._sensors.values():
             sensor.restart(refuted.since)
@@ -315,7 +319,7 @@ class Ekf(Filter):
         return PoseEstimate(self._t, pose, covariance, self._status(doubted=is_doubted(self._sensors.values())))
 
     def _status(self, *, doubted: bool) -> Status:
-        """The status of the present estimate. ``doubted``: True if a sensor contradicts it."""
+        """Return the status of the present estimate. ``doubted``: True if a sensor contradicts it."""
         unsure = doubted or self._search.is_unsure(self._t, self._state.covariance)
         return "ambiguous" if unsure else "localized"
 
@@ -329,6 +333,6 @@ class Ekf(Filter):
 
 
 def _at_its_time(observation: Observation, state: _State) -> Observation | None:
-    """Return an observation as a function of the pose at its own time, None if it has no such form. Constants and
-    landmarks are fixed at ``state``."""
+    """Return an observation as a function of the pose at its own time. Returns None if this is impossible. Constants
+    and landmarks are fixed at ``state``."""
     return state.on_pose(observation).at_its_time()

@@ -39,8 +39,9 @@ class FilterSettings(FileModel):
 class Checkpoint(NamedTuple):
     """A copy of a filter's state, to return to if a late measurement arrives.
 
-    ``state``: the estimate. ``t`` [s], ``odometry``: its time, and the integrated odometry at that time. ``records``,
-    ``ticks``: the numbers of records for smoothing and of times at which the run recorded the pose, so far.
+    ``state``: the estimate. ``t`` [s]: its time. ``odometry``: the integrated odometry at ``t``. ``records``: the
+    number of records stored for smoothing so far. ``ticks``: the number of times so far at which the run recorded the
+    pose.
     """
 
     state: Any
@@ -69,7 +70,7 @@ class FilterView:
     def value(self, name: str) -> Array | None: ...
 
     def poses_at(self, times: Array) -> Array:
-        """Return the robot's poses (N, 3) at ``times`` (N,) [s] in the frame of the filter's present pose."""
+        """Return the robot's poses (N, 3) at earlier ``times`` (N,) [s] by odometry, relative to its present pose."""
         constants = self.value(MOTION)
         values = np.zeros(0) if constants is None else constants
         return np.asarray(self._filter._motion.poses_at(self._filter._odometry, times, values))
@@ -79,11 +80,12 @@ class FilterView:
         return None
 
     def track(self) -> Tracked:
-        """Return the present estimate of the pose, with the odometry at that time."""
+        """Return the present estimate of the pose, its covariance, and the integrated odometry at the present time."""
         return Tracked(self._filter._odometry, self.pose, self.covariance)
 
     def pose_back(self, t: float, pose: Array) -> Array:
-        """Return the robot's pose (3,) at an earlier time ``t`` [s], if the robot is at ``pose`` (3,) now."""
+        """Return the robot's pose (3,) at an earlier time ``t`` [s], computed from its present ``pose`` (3,) by
+        odometry."""
         return se2.compose(pose, self.poses_at(np.array([t]))[0])
 
 
@@ -127,7 +129,7 @@ class Filter(Timeline):
             self._ahead = None
 
     def learnt(self) -> Learnt:
-        """Return an empty result. Filters that estimate constants or landmarks override this."""
+        """Return an empty result. Subclasses that estimate constants or landmarks override this method."""
         return Learnt()
 
     def forget(self, until: float) -> None:
@@ -145,7 +147,7 @@ class Filter(Timeline):
 
     @abstractmethod
     def trajectory(self) -> Trajectory:
-        """Return the best estimate of all past poses, at the times at which a run records the pose."""
+        """Return the best estimates of all past poses, at the times at which the run recorded the pose."""
 
     @abstractmethod
     def _start(self, prior: PosePrior) -> Any:
@@ -157,10 +159,11 @@ class Filter(Timeline):
 
     @abstractmethod
     def _see(self, m: Any) -> None:
-        """Update the state by a measurement. The state is already predicted to the measurement's time."""
+        """Update the state by the measurement ``m``. The state must already be predicted to the measurement's time."""
 
     def _pass(self, tick: Tick) -> None:
-        """Continue a running search for the pose. Called at each ``tick`` (a time at which a run records the pose)."""
+        """Continue a global search for the pose, if one is running. Called at each ``tick`` (a time at which a run
+        records the pose)."""
         return
 
     @abstractmethod
@@ -172,7 +175,8 @@ class Filter(Timeline):
         """Return the data of the present state that :meth:`trajectory` needs, with an attribute ``t``, the time [s]."""
 
     def _seek(self, m: Any) -> Any:
-        """Search the start pose with a measurement. Returns the first state, or None if the pose is still unknown."""
+        """Search the start pose with the measurement ``m``. Returns the first state, or None if the pose is still
+        unknown."""
         return None
 
     def _estimate_at(self, t: float | None) -> PoseEstimate:
@@ -208,8 +212,8 @@ class Filter(Timeline):
         self._t = t
 
     def _begin(self, m: Measurement) -> None:
-        """Process a measurement before the start. The filter starts at the first measurement that determines the pose,
-        or when the search has found the pose."""
+        """Process a measurement before the filter has started. The filter starts at the first measurement that
+        determines the pose, or when a global search has found the pose."""
         if self._seeking is not None:
             super()._begin(m)
         elif not isinstance(m, Tick):
@@ -250,10 +254,10 @@ class Filter(Timeline):
 
 
 def at_ticks(ticks: Sequence[float], t: Array, poses: Array, body_covariances: Array) -> Trajectory:
-    """Make a trajectory at the times ``ticks`` from records at times ``t`` (N,).
+    """Return a trajectory at the times ``ticks`` [s], selected from records at times ``t`` (N,) [s].
 
-    ``poses`` (N, 3), ``body_covariances`` (N, 3, 3): the estimates, with covariances in the body frame. If several
-    records have one time, the last one is used.
+    ``poses`` (N, 3), ``body_covariances`` (N, 3, 3): the recorded estimates, with covariances in the body frame. If
+    several records have the same time, the last one is used.
     """
     rows = np.searchsorted(t, np.unique(np.array(ticks)), side="right") - 1
     covariances = se2.body_to_world(poses[rows], body_covariances[rows])

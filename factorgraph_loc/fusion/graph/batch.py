@@ -22,8 +22,9 @@ NARROWED = 0.5  # each step of graduated non-convexity multiplies the scales by 
 
 
 def whole_problem(graph: Graph, width: float = 1.0, link_width: float = 1.0) -> Problem:
-    """Return all measurements of a graph as one problem. ``link_width``: a factor on the scales of the robust losses of
-    links between two poses, such as loop closures. ``width``: a factor on the scales of all other robust losses."""
+    """Return a least-squares problem with all measurements of a graph. ``link_width``: a factor on the scales of the
+    robust losses of factors between two poses, such as loop closures. ``width``: a factor on the scales of all other
+    robust losses."""
     assert graph.prior is not None
     keyframes = list(graph.keyframes.values())
     body = se2.world_to_body(graph.prior.pose, graph.prior.covariance)
@@ -41,8 +42,8 @@ def whole_problem(graph: Graph, width: float = 1.0, link_width: float = 1.0) -> 
 
 
 def convex_width(graph: Graph, values: Values) -> float:
-    """Return the smallest factor on the scales of losses, at least 1, that makes the losses of all links convex at
-    ``values``. A link is a factor between two poses, such as a loop closure."""
+    """Return a factor on the scales of robust losses, at least 1. It is the smallest that makes all losses of factors
+    between two poses, such as loop closures, convex at ``values``."""
     linked = {name: sensor for name, sensor in graph.sensors.items() if sensor.links}
     nodes = (node for k in graph.keyframes.values() for node in k.nodes if linked and node.sensor in linked)
     return max(
@@ -52,10 +53,11 @@ def convex_width(graph: Graph, values: Values) -> float:
 
 
 def best_optimum(graph: Graph, start: Values, widest: float) -> tuple[Problem, Solution]:
-    """Optimise a graph directly and by graduated non-convexity. Returns the problem and the better optimum.
+    """Optimise a graph directly and by graduated non-convexity. Returns the problem, and the optimum with the lower
+    cost.
 
-    ``start``: initial values. ``widest``: the initial factor on the scales of the losses. If it is 1 and the losses of
-    loop closures are convex, only the direct optimum is computed.
+    ``start``: initial values. ``widest``: the initial factor on the scales of the robust losses. If it is 1 and the
+    losses of loop closures are convex, only the direct optimum is computed.
     """
     problem = whole_problem(graph)
     best = problem.solve(start)
@@ -71,7 +73,8 @@ def best_optimum(graph: Graph, start: Values, widest: float) -> tuple[Problem, S
 
 
 def solve_whole(graph: Graph, start: Values, *, is_guess: bool) -> tuple[Array, Array]:
-    """Solve a graph with all its measurements. Returns poses (M, 3) and body-frame covariances (M, 3, 3) of keyframes.
+    """Optimise a graph with all its measurements. Returns poses (M, 3) and body-frame covariances (M, 3, 3) of the
+    keyframes.
 
     The estimates of all other variables are written into the graph. Observations of points that are certainly false
     matches are removed. ``start``: initial values of all variables. ``is_guess``: True to use graduated non-convexity,
@@ -97,23 +100,24 @@ def solve_whole(graph: Graph, start: Values, *, is_guess: bool) -> tuple[Array, 
 
 
 class AtTheEnd:
-    """A backend that solves the graph only at the end of a run. Rough estimates of the run are the initial values."""
+    """A solver that optimises the graph only at the end of a run. The initial values are rough estimates from during
+    the run."""
 
     def __init__(self, graph: Graph) -> None:
         self._graph = graph
         self._guesses: Values = {}  # rough estimates of all variables except poses
 
     def begin(self, newest: Keyframe) -> None:
-        """Begin with the keyframe ``newest``: at the start of the graph, or after keyframes were removed and ``newest``
-        was added."""
+        """Prepare for the keyframe ``newest``. Call this at the start of the graph, and whenever keyframes were removed
+        before ``newest`` was added."""
         graph = self._graph
         graph.forget_landmarks(())
         self._guesses = {key: value for key, value in self._guesses.items() if key in graph.values}
         newest.causal = graph.pose, graph.covariance
 
     def attach(self, keyframe: Keyframe, addition: Addition, guess: Guess | None) -> None:
-        """Store the new variables of ``addition``, which were observed at ``keyframe``. ``guess``: the pose and
-        covariance of this keyframe, or None if it is not the newest keyframe."""
+        """Store the initial values of new variables. ``addition``: new factors and variables at ``keyframe``.
+        ``guess``: the estimated pose and covariance of this keyframe, or None if it is not the newest keyframe."""
         self._guesses |= addition.values
         if guess is not None:
             keyframe.causal = self._graph.pose, self._graph.covariance = guess
@@ -121,16 +125,16 @@ class AtTheEnd:
     extend = attach
 
     def current(self, key: int) -> Array:
-        """Return the present estimate of the variable ``key``, which must not be a pose."""
+        """Return the initial value of the variable ``key``, which must not be a pose."""
         return self._guesses[key]
 
     def is_open(self, keyframe: int) -> bool:
-        """True if factors may still be added to the keyframe with this number."""
+        """Return True if factors may still be added to the keyframe with this number."""
         return keyframe in self._graph.keyframes
 
     is_kept = is_open
 
     def final(self, graph: Graph) -> tuple[Array, Array]:
-        """Solve the whole ``graph``. Returns poses (M, 3) and body-frame covariances (M, 3, 3) of all keyframes."""
+        """Optimise the whole ``graph``. Returns poses (M, 3) and body-frame covariances (M, 3, 3) of all keyframes."""
         poses = {k.key: k.causal[0] for k in graph.keyframes.values() if k.causal is not None}
         return solve_whole(graph, graph.constant_priors()[0] | self._guesses | poses, is_guess=True)

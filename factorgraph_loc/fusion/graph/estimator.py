@@ -96,7 +96,8 @@ class Smoother(Timeline):
         self._conclusion: _Conclusion | None = None  # the final solution, discarded at each measurement
 
     def initialize(self, prior: PosePrior) -> None:
-        """Start from a Gaussian prior of the pose. If the prior has no heading, the graph starts when the search has found one."""
+        """Start from a Gaussian prior of the pose. If the prior has no heading, the graph starts when measurements have
+        determined the heading."""
         if not prior.has_heading:
             self._seek_heading(prior, self._search)
             return
@@ -126,14 +127,14 @@ class Smoother(Timeline):
         return PoseEstimate(at, pose, covariance, self._status(covariance))
 
     def _status(self, covariance: Array) -> Status:
-        """The status of an estimate at the present time with this ``covariance`` (3, 3)."""
+        """Return the status of a present estimate with this ``covariance`` (3, 3) of (x, y, heading)."""
         if self._settings.final_only:
             return "unlocalized"
         doubted = self._behind or self._search.doubts or self._search.is_unsure(self._t, covariance)
         return "ambiguous" if doubted else "localized"
 
     def record(self, ticks: Sequence[float]) -> list[PoseEstimate]:
-        """Process ``ticks``, times [s] at which a run records the pose. Returns the estimate at each of them."""
+        """Return one estimate for each of ``ticks``, increasing times [s] at which a run records the pose."""
         estimates: list[PoseEstimate] = []
         while len(estimates) < len(ticks):
             rest = ticks[len(estimates) :]
@@ -142,7 +143,8 @@ class Smoother(Timeline):
         return estimates
 
     def _simple(self, ticks: Sequence[float]) -> int:
-        """The number of first ``ticks`` [s] that change nothing: no search is running, and no keyframe is due."""
+        """Return the number of first ``ticks`` [s] that need only a prediction: no search is running, and no keyframe
+        is due."""
         waits = self._begun == math.inf or self._behind or self._search.waits or not self._graph.is_anchored
         if waits or ticks[0] <= max(self._t, self._graph.newest.t):
             return 0
@@ -161,27 +163,27 @@ class Smoother(Timeline):
         return estimates
 
     def learnt(self) -> Learnt:
-        """Return the estimated constants and landmarks of the final solution."""
+        """Return the estimated sensor constants, landmarks and points of the final solution, with covariances."""
         if self._graph.prior is None:
             return _learnt(self._graph)
         end = self._concluded()
         return _learnt(end.graph, end.poses, end.covariances)
 
     def trajectory(self) -> Trajectory:
-        """Return the best estimate of all poses since the start, at the times at which a run records the pose.
-        The trajectory is empty if the start pose was never found."""
+        """Return the final estimates of all poses since the start, at the times at which the run recorded the pose. The
+        trajectory is empty if the start pose was never found."""
         if self._graph.prior is None:
             return Trajectory(np.empty(0), np.empty((0, 3)), np.empty((0, 3, 3)))
         end = self._concluded()
         return _trajectory(end.graph, end.poses, end.covariances)
 
     def final_diagnostics(self) -> Diagnostics:
-        """Return the diagnostics of the run and of the final solution."""
+        """Return the diagnostics of the run, including those of the final solution."""
         return self.diagnostics if self._graph.prior is None else self._concluded().graph.diagnostics
 
     def forget(self, until: float) -> None:
-        """Delete the trajectory before the time ``until`` [s], except for the part in the window. If ``lag`` is not a
-        number of seconds, nothing is deleted."""
+        """Delete the trajectory before the time ``until`` [s], except for the part in the window of the last ``lag``
+        seconds. If ``lag`` is not a number of seconds, nothing is deleted."""
         if isinstance(self._backend, Incremental):
             self._backend.forget(min(until, self._taken_until - self._settings.max_delay))
 
@@ -212,7 +214,7 @@ class Smoother(Timeline):
 
     def _doubt(self, m: Measurement) -> None:
         """Check after the measurement ``m`` whether recent observations contradict the estimated poses. If they do,
-        continue at the pose that the search has found."""
+        continue at the pose that a global search has found."""
         graph, odometry = self._graph, self._odometry
 
         def track() -> Tracked:
@@ -256,8 +258,8 @@ class Smoother(Timeline):
         self._replay(replay)
 
     def _placed(self, t: float, best: PosePrior) -> Array:
-        """Return the robot's pose (3,) at time ``t`` [s], from the pose ``best`` at a later time and the odometry in
-        between. ``best``: the result of the search."""
+        """Return the robot's pose (3,) at time ``t`` [s], computed by odometry from ``best``, its pose at a later
+        time."""
         moved = self._motion.relative(self._motion.state(t), self._motion.state(best.t))
         return se2.compose(best.pose, se2.inverse(self._graph.recalibrated(moved).delta))
 

@@ -44,8 +44,8 @@ NOTHING_KNOWN = np.zeros(0)  # the empty array of the odometry's estimated const
 @dataclass(frozen=True)
 class Node:
     """A factor of the graph. ``keys``: the keys of its variables. ``factor``: the factor, with ``rows`` residuals.
-    ``native``: an equivalent factor of GTSAM, which solvers prefer. One of ``factor`` and ``native`` may be None.
-    ``sensor``: the name of the sensor."""
+    ``native``: an equivalent factor of GTSAM, used instead if it is given. One of ``factor`` and ``native`` may be
+    None. ``sensor``: the name of the sensor."""
 
     keys: tuple[int, ...]
     factor: Factor | None = None
@@ -61,9 +61,9 @@ Guess = tuple[Array, Array]  # a pose (3,) and its body-frame covariance (3, 3)
 class Keyframe:
     """A pose variable of the graph.
 
-    ``index``, ``key``: its number and its key. ``t`` [s], ``odometry``: its time, and the integrated odometry at that
-    time. ``from_previous``: the motion since the previous keyframe. ``factor``: the factor of this motion, None until
-    it is needed. ``is_elsewhere``: True if the robot was carried since the previous keyframe. ``nodes``: the factors of
+    ``index``, ``key``: its number and its key. ``t`` [s]: its time. ``odometry``: the integrated odometry at ``t``.
+    ``from_previous``: the motion since the previous keyframe. ``factor``: the factor of this motion, None until it is
+    needed. ``is_elsewhere``: True if the robot was carried since the previous keyframe. ``nodes``: the factors of
     measurements. ``causal``: the estimate while this keyframe was the newest. ``final``: the estimate when this
     keyframe left the window.
     """
@@ -84,8 +84,8 @@ class Keyframe:
 
 
 class TickAt(NamedTuple):
-    """A time ``t`` [s] at which the trajectory needs a pose. ``keyframe``: the number of the previous keyframe.
-    ``odometry``: the integrated odometry at ``t``."""
+    """A time ``t`` [s] at which the trajectory needs a pose. ``keyframe``: the number of the last keyframe before
+    ``t``. ``odometry``: the integrated odometry at ``t``."""
 
     t: float
     keyframe: int
@@ -94,7 +94,7 @@ class TickAt(NamedTuple):
 
 @dataclass
 class Addition:
-    """New factors (``nodes``) of the graph, and new variables with their initial ``values``, by key."""
+    """New factors (``nodes``) and new variables for a graph. ``values``: the variables' initial values, by key."""
 
     nodes: list[Node] = field(default_factory=list)
     values: Values = field(default_factory=dict)
@@ -110,7 +110,7 @@ JUMPED = 50.0
 
 
 def jumps(guess: Guess, pose: Array) -> bool:
-    """True if a solved ``pose`` (3,) is not plausible given the prediction ``guess``."""
+    """Return True if ``pose`` (3,) is far outside of the Gaussian ``guess`` (predicted pose and covariance)."""
     return not positive.squared(se2.log(se2.between(guess[0], pose)), guess[1]) < JUMPED
 
 
@@ -136,15 +136,16 @@ class Mapper:
 
     def take(self, m: Any, keyframe: Keyframe, guess: Guess, graph: Graph, addition: Addition) -> Guess:
         """Process a measurement at the newest keyframe, and add its factors and points to ``addition``. ``guess``: pose
-        and covariance of the keyframe. Returns the pose and covariance after a correction by the measurement."""
+        and covariance of the keyframe. Returns pose and covariance, corrected by the measurement."""
         return guess
 
     def is_astray(self, node: Node, values: Values) -> bool:
-        """True if a node is an observation of a point that certainly is a false match, judged at the estimates ``values``."""
+        """Return True if ``node`` is the observation of a point, and certainly a false match given the estimates
+        ``values``."""
         return False
 
     def point(self, node: Node) -> int | None:
-        """Return the key of the point if a node is an observation of a point, otherwise None."""
+        """Return the key of the observed point if ``node`` is an observation of a point, otherwise None."""
         return None
 
     def leave(self, t: float) -> Sequence[int]:
@@ -161,7 +162,7 @@ class Mapper:
 
     def learnt(self, values: Mapping[int, Array], covariances: Mapping[int, Array]) -> PointMap | None:
         """Return a map of all points that were ever in the graph and are not deleted, None if there are none.
-        ``values``, ``covariances``: the estimates of points and keyframes by key."""
+        ``values``, ``covariances``: the estimates and covariances of points and keyframes by key."""
         return None
 
 
@@ -203,7 +204,7 @@ class Graph:
         return self.newest
 
     def copy(self) -> Graph:
-        """Return an independent copy of the graph, which can be solved separately."""
+        """Return a copy of the graph with its own values, lists of factors and diagnostics, to solve it separately."""
         graph = object.__new__(Graph)
         vars(graph).update(vars(self))
         graph.diagnostics = self.diagnostics.copy()
@@ -222,14 +223,16 @@ class Graph:
         self.keyframes[keyframe.index] = self.newest = keyframe
 
     def cut(self, first: int, t: float) -> None:
-        """Remove the keyframes from number ``first`` on. The trajectory is cut before them, and before ``t`` [s]."""
+        """Remove keyframe ``first`` and all later ones. The trajectory is removed from it or, if earlier, from ``t``
+        [s] on."""
         for index in range(first, self.newest.index + 1):
             del self.keyframes[index]
         self.newest = self.keyframes[first - 1]
         self.ticks = [tick for tick in self.ticks if tick.keyframe < first and tick.t < t]
 
     def forget(self, first: int) -> None:
-        """Delete the keyframes before number ``first``, the trajectory before it, and points not observed since."""
+        """Delete the keyframes before number ``first``, the trajectory before it, and points that are not observed
+        since."""
         for index in range(next(iter(self.keyframes)), first):
             del self.keyframes[index]
         self.ticks = [tick for tick in self.ticks if tick.keyframe >= first]
@@ -245,13 +248,13 @@ class Graph:
         return keyframe
 
     def since(self, keyframe: Keyframe, t: float) -> Increment:
-        """Return the motion from a keyframe to time ``t`` [s], with the estimated constants of the odometry."""
+        """Return the motion from a keyframe to time ``t`` [s] by odometry, corrected with its estimated constants."""
         start = keyframe.odometry if self.is_anchored else self.motion.state(keyframe.t)
         return self.recalibrated(self.motion.relative(start, self.motion.state(t)))
 
     def part_of_step(self, keyframe: Keyframe, t: float) -> Increment:
-        """Return the motion from a keyframe to a time ``t`` [s] before the next keyframe. It is interpolated along the
-        arc to the next keyframe in proportion to time, because the odometry may already be deleted."""
+        """Return the motion from ``keyframe`` to the time ``t`` [s], which must lie between this keyframe and the next
+        one. The motion between them is interpolated along an arc in proportion to time."""
         following = self.keyframes[keyframe.index + 1]
         assert following.from_previous is not None
         step, share = self.recalibrated(following.from_previous), (t - keyframe.t) / (following.t - keyframe.t)
@@ -259,8 +262,8 @@ class Graph:
         return Increment(delta, share * step.covariance, share * step.duration, share * step.still)
 
     def moved(self, t: float) -> tuple[Array, Array, Array]:
-        """Return the newest pose (3,), predicted by odometry to ``t`` [s] if ``t`` is later. Also returns its
-        covariance (3, 3) twice, in the body frame and in the world frame."""
+        """Return the newest pose (3,), predicted by odometry to ``t`` [s] if ``t`` is later. Also returns the pose's
+        covariance (3, 3) in the body frame, then in the world frame."""
         if t <= self.newest.t:
             return self.pose, self.covariance, se2.body_to_world_one(self.pose, self.covariance)
         _, poses, bodies, worlds = self.all_moved((t,))
@@ -273,7 +276,7 @@ class Graph:
         return self.motion.moved(start, times, self.pose, self.covariance, self.value(MOTION, NOTHING_KNOWN))
 
     def between(self, first: Keyframe, last: Keyframe) -> Increment:
-        """Return the motion from the keyframe ``first`` to ``last``, with the estimated constants of the odometry."""
+        """Return the motion between two keyframes by odometry, corrected with its estimated constants."""
         return self.recalibrated(self.motion.relative(first.odometry, last.odometry))
 
     @property
@@ -287,8 +290,8 @@ class Graph:
         return increment if key is None else self.motion.recalibrated(increment, self.values[key])
 
     def value(self, name: str, default: Array | None = None) -> Array:
-        """Return the estimate of the sensor constants or of the landmark called ``name``, or ``default`` if the graph
-        does not contain them. Raises KeyError if ``default`` is None, too."""
+        """Return the estimate of the sensor constants or of the landmark ``name``. If the graph does not contain them,
+        returns ``default``, or raises KeyError if ``default`` is None."""
         if default is not None and name not in self.keys:
             return default
         return self.values[self.keys[name]]
@@ -299,8 +302,8 @@ class Graph:
         return {key: np.zeros(len(s)) for key, s in sigmas.items()}, {key: np.diag(s**2) for key, s in sigmas.items()}
 
     def new_block(self, new: NewVariable, covariance: Array) -> int:
-        """Add the landmark or bias ``new`` as a variable, and return its key. ``covariance`` (3, 3): the covariance of
-        the observing pose."""
+        """Add the landmark or bias ``new`` as a variable, and return its key. ``covariance`` (3, 3): the body-frame
+        covariance of the pose that observed it."""
         is_position = len(new.mean) > 1
         numbers = [index_of(key) for key in self.keys.values() if is_landmark(key) is is_position]
         first = 0 if is_position else len(self.constants)
@@ -310,7 +313,7 @@ class Graph:
         return key
 
     def node(self, keyframe: Keyframe, term: Term, sensor: str) -> Node:
-        """Make a node of the graph from one term (one factor) of an observation at a keyframe. ``sensor``: the sensor's name."""
+        """Return a factor of an observation (``term``) at a keyframe as a node. ``sensor``: the name of the sensor."""
         keys = (keyframe.key, *map(self.keys.__getitem__, term.blocks))
         return Node(keys, term.factor, term.rows, sensor=sensor)
 
@@ -330,8 +333,8 @@ class Graph:
         return keyframe.factor, keys
 
     def drop_astray(self, keyframes: Collection[Keyframe], values: Values) -> bool:
-        """Remove observations in ``keyframes`` that do not fit the estimate of their point in ``values``, and points
-        with too few remaining observations. Returns True if any was removed."""
+        """Remove observations in ``keyframes`` that do not fit the estimate of their point in ``values``. Also removes
+        points with too few remaining observations. Returns True if any was removed."""
         mapper = self.mapper
         if not mapper.estimates:
             return False
@@ -365,25 +368,25 @@ class Graph:
             del self.values[key]  # the tilt of a removed keyframe
 
     def forget_landmarks(self, known: Collection[int]) -> None:
-        """Remove landmarks and biases that no remaining keyframe observes. ``known``: the keys of variables that are
-        kept, because marginalised keyframes gave information on them."""
+        """Remove landmarks and biases that no remaining keyframe observes. ``known``: keys of variables that are not
+        removed, because marginalised keyframes observed them."""
         observed = {key for k in self.keyframes.values() for node in k.nodes for key in node.keys}
         for name, key in list(self.keys.items()):
             if name not in self.constants and key not in observed and key not in known:
                 del self.keys[name], self.values[key], self.covariances[key]
 
     def report_damping(self, damping: float) -> None:
-        """Add an event to the diagnostics if ``damping``, which was needed to compute covariances, is larger than ever before."""
+        """Add an event to the diagnostics if ``damping``, used to compute covariances, is larger than ever before."""
         if damping > self._damping:
             self._damping = damping
             self.diagnostics.event(self.t, "damped", DAMPED, damping=damping)
 
     def unsolved(self, error: Exception) -> RunFailedError:
-        """Return the error of a graph that cannot be solved, with a message. ``error``: the solver's exception."""
+        """Return an error with the message that the graph cannot be solved. ``error``: the solver's exception."""
         return RunFailedError(f"the graph cannot be solved at {self.t:.3f} s: {self.reason(error)}")
 
     def reason(self, error: Exception) -> str:
-        """Return a description in one line of ``error``, an error of this solver or of GTSAM."""
+        """Return one line that describes ``error``, an exception of this solver or of GTSAM."""
         key = blamed(error)
         if key is None:
             lines = str(error).strip().splitlines()

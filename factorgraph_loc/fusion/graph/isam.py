@@ -33,7 +33,7 @@ ROUNDING = 1e-6  # s: rounding error of differences of times
 
 
 class Incremental:
-    """The backend of the smoother, which solves the graph incrementally during the run. See the module docstring."""
+    """Solves the graph of the smoother incrementally during the run, by iSAM2. See the module docstring."""
 
     def __init__(self, graph: Graph, settings: SmootherSettings) -> None:
         self._graph, self._settings = graph, settings
@@ -65,8 +65,8 @@ class Incremental:
         self._oldest = 0  # the number of the oldest keyframe that has not left the window
 
     def forget(self, until: float) -> None:
-        """Delete the keyframes before the time ``until`` [s] that have left the window. If the whole problem is solved
-        at the end, all keyframes are needed and nothing is deleted."""
+        """Delete the keyframes before the time ``until`` [s] that have left the window. If all keyframes are optimised
+        together at the end of the run, nothing is deleted."""
         graph = self._graph
         if self._is_whole or not graph.keyframes or until < next(iter(graph.keyframes.values())).t:
             return
@@ -77,9 +77,9 @@ class Incremental:
     def final(self, graph: Graph) -> tuple[Array, Array]:
         """Return the final poses (M, 3) and covariances (M, 3, 3) of the keyframes of ``graph``, a copy of the graph.
 
-        Covariances are in the body frame. If the setting ``lag`` is not a number of seconds, the whole problem is
-        solved. Otherwise poses outside of the window have the estimates from when they left it, and poses in the window
-        have present estimates.
+        Covariances are in the body frame. If the setting ``lag`` is not a number of seconds, all poses are optimised
+        together. Otherwise poses in the window have their present estimates. Older poses have the estimates from when
+        they left the window.
         """
         if self._settings.smooth and self._is_whole:
             return solve_whole(graph, self._newest_values(graph), is_guess=self._settings.final_only)
@@ -107,7 +107,8 @@ class Incremental:
         return known | {key: self._solver.value(key) for key in keys if key not in known}
 
     def begin(self, newest: Keyframe) -> None:
-        """Build a new solver: at the start, or after keyframes were removed and ``newest`` was added."""
+        """Replace the solver by a new one. Call this at the start, and whenever keyframes were removed before
+        ``newest`` was added."""
         newest.causal = self._graph.pose, self._graph.covariance
         summary = self._solver.summary(failed=False)
         summary = None if summary is None else summary.before_pose(newest.index)
@@ -115,8 +116,8 @@ class Incremental:
         self._start_again(newest, summary)
 
     def extend(self, keyframe: Keyframe, addition: Addition, guess: Guess) -> None:
-        """Add a new keyframe with the factors and variables of ``addition``. ``guess``: the predicted pose of the
-        keyframe, and its covariance."""
+        """Add the new ``keyframe`` to the solver, with the factors and variables of ``addition``. ``guess``: the
+        predicted pose and covariance of the keyframe."""
         keyframe.causal = guess
         addition.nodes.insert(0, self._odometry_node(keyframe))
         addition.values[keyframe.key] = guess[0]
@@ -126,8 +127,8 @@ class Incremental:
             self._update(addition)
 
     def attach(self, keyframe: Keyframe, addition: Addition, guess: Guess | None) -> None:
-        """Add the factors and variables of ``addition`` on an existing keyframe. ``guess``: its pose corrected by the
-        factors, with covariance, or None if ``keyframe`` is not the newest."""
+        """Add the factors and variables of ``addition`` at an existing ``keyframe``. ``guess``: the keyframe's pose and
+        covariance after a correction by the factors, or None if it is not the newest keyframe."""
         if guess is None or not (self._waits or keyframe.t < self._solved + self._solve_every):
             self._update(addition)
             return
@@ -148,11 +149,11 @@ class Incremental:
         return self._solver.value(key)
 
     def is_open(self, keyframe: int) -> bool:
-        """True if factors may still be added to the keyframe with this number, because it is in the window."""
+        """Return True if factors may still be added to the keyframe with this number, because it is in the window."""
         return keyframe >= self._oldest and keyframe in self._graph.keyframes
 
     def is_kept(self, keyframe: int) -> bool:
-        """True if the keyframe with this number is part of the final problem."""
+        """Return True if the final optimisation includes the keyframe with this number."""
         return self._is_whole or self.is_open(keyframe)
 
     def _update(self, addition: Addition) -> None:
@@ -201,7 +202,8 @@ class Incremental:
 
     def _marginal(self, key: int, known: Array | None = None, graph: Graph | None = None) -> Guess:
         """Return the estimate and covariance of the variable ``key``. ``known``: the covariance if it is already
-        computed. ``graph``: where a damping of the covariance is reported, by default the graph of the run."""
+        computed. ``graph``: the graph whose diagnostics get a report if the covariance needed damping, by default the
+        graph of the run."""
         value = self._value(key)
         try:
             covariance = self._solver.covariance(key) if known is None else known
@@ -265,11 +267,11 @@ class Incremental:
             del self._graph.values[key], self._graph.covariances[key]
 
     def _start_again(self, newest: Keyframe, summary: MarginalSummary | None, *, failed: bool = False) -> None:
-        """Build a new solver from the graph, whose last keyframe is ``newest``.
+        """Build a new solver from the graph. ``newest``: the last keyframe.
 
-        ``summary``: the information of variables that have left the window. The new solver begins with this summary,
-        and with all measurements that are not part of it. If it is None, the solver begins with the priors. ``failed``:
-        True if the previous solver failed. Raises RunFailedError if the new solver fails.
+        ``summary``: the marginal factors of variables that have left the window. The new solver gets these, and all
+        measurements that they do not contain. If it is None, the solver gets the priors and all measurements.
+        ``failed``: True if the previous solver failed. Raises RunFailedError if the new solver fails.
         """
         graph, first = self._graph, 0 if summary is None else summary.oldest
         self._solver, self._waiting, self._solved = self._new_solver(failed=failed), Addition(), newest.t

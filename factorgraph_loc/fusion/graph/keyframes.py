@@ -40,7 +40,7 @@ Backend = AtTheEnd | Incremental  # solves the graph
 
 
 class _KeyframeView:
-    """Gives the sensor of a measurement on one keyframe read access to the state of the graph.
+    """Gives a sensor read access to the estimates while its measurement at one keyframe is processed.
 
     ``guess``: pose and covariance of the keyframe. ``offset``: the motion from the keyframe to the measurement, None
     for zero. ``newest``: True if the keyframe is the newest one.
@@ -86,7 +86,7 @@ class _KeyframeView:
 
 
 class Builder:
-    """Builds a graph from measurements during a run. See the module docstring."""
+    """Builds a factor graph from measurements during a run. See the module docstring."""
 
     def __init__(self, graph: Graph, backend: Backend, search: Tracking, settings: GraphSettings) -> None:
         self._graph, self._backend, self._search, self._settings = graph, backend, search, settings
@@ -96,11 +96,12 @@ class Builder:
         self._gatherer: Sensor | None = None  # the sensor of the collected observations
 
     def is_due(self, t: float) -> bool:
-        """True if a tick at ``t`` [s] becomes a keyframe, because the last keyframe is old."""
+        """Return True if a new keyframe is needed at ``t`` [s], because the last keyframe is old."""
         return t - self._graph.newest.t >= LONGEST_INTERVAL
 
     def pass_time(self, odometry: ChainState) -> None:
-        """Process a time at which the run records the pose. ``odometry``: the integrated odometry at this time."""
+        """Process a time at which the run records the pose. ``odometry``: the integrated odometry at this time, with
+        the time."""
         graph, t = self._graph, odometry.t
         graph.t = max(graph.t, t)
         if self.is_due(t):
@@ -108,8 +109,8 @@ class Builder:
         graph.ticks.append(TickAt(t, graph.keyframe_before(t).index, odometry))
 
     def take(self, m: Measurement, odometry: ChainState) -> bool:
-        """Process a measurement. ``odometry``: the integrated odometry at its time. Returns False if the measurement is
-        ignored, because its keyframe has already left the solver."""
+        """Convert a measurement to factors of the graph. ``odometry``: the integrated odometry at its time. Returns
+        False if it is ignored, because its keyframe is no longer in the solver."""
         graph, sensor = self._graph, self._graph.sensors[m.source]
         graph.t = max(graph.t, m.t)
         if self._needs_keyframe(m, sensor):
@@ -140,7 +141,7 @@ class Builder:
         return since >= interval or (since > 0.0 and m.source == mapper.sensor and mapper.is_due(m))
 
     def gather(self) -> list[Node]:
-        """Convert the collected observations to factors of the newest keyframe, and add them. Returns the factors."""
+        """Convert the collected observations to factors, add these to the newest keyframe, and return them."""
         nodes = self.waiting() if self._waiting else []
         self._graph.newest.nodes += nodes
         self._waiting = []

@@ -49,7 +49,8 @@ State = tuple[Array, Array]  # poses (N, 3), and parameters (P,)
 
 
 class IndeterminateError(RuntimeError):
-    """The error of a graph that does not determine its variables. ``key``: the key of one of these variables, None if unknown."""
+    """The error of a graph whose factors do not determine all variables. ``key``: the key of an undetermined variable,
+    None if unknown."""
 
     def __init__(self, key: int | None) -> None:
         super().__init__("the solution is not determined")
@@ -58,7 +59,8 @@ class IndeterminateError(RuntimeError):
 
 @dataclass(frozen=True)
 class Covariances:
-    """Marginal covariances (d, d) by key, and the relative ``damping`` that was needed to compute them."""
+    """Marginal covariances of variables. ``by_key``: an array (d, d) per key. ``damping``: the prior information that
+    was added to compute them, as a fraction of the diagonal of the information matrix. It is 0 if none was needed."""
 
     by_key: dict[int, Array]
     damping: float
@@ -66,8 +68,8 @@ class Covariances:
 
 def covariances(graph: gtsam.GaussianFactorGraph, sizes: Mapping[int, int], keys: Sequence[int]) -> Covariances:
     """Return the marginal covariances of the variables ``keys`` of a linear graph. ``sizes``: the number of components
-    of each variable of the graph. Raises IndeterminateError if the graph does not determine a variable even with
-    damping."""
+    of each variable of the graph by key. Raises IndeterminateError if the graph does not determine a variable, even
+    with weak priors."""
     result = _solved(graph, keys, robust=False)
     if isinstance(result, dict):
         return Covariances(result, 0.0)
@@ -79,7 +81,7 @@ def covariances(graph: gtsam.GaussianFactorGraph, sizes: Mapping[int, int], keys
 
 
 def blamed(error: Exception) -> int | None:
-    """Return the key of the undetermined variable that an error of GTSAM or IndeterminateError names, or None."""
+    """Return the key of the undetermined variable that an exception of GTSAM or IndeterminateError names, or None."""
     if isinstance(error, IndeterminateError):
         return error.key
     near = _NEAR.search(str(error))
@@ -128,8 +130,8 @@ def _damped(graph: gtsam.GaussianFactorGraph, sizes: Mapping[int, int], damping:
 
 
 class Chained:
-    """A problem that is a chain of poses. Each factor depends on one pose or on two consecutive poses, and optionally
-    on vectors, such as sensor constants. ``factors``: the factors with the keys of their variables."""
+    """A least-squares problem on a chain of poses. Each factor depends on one pose or on two consecutive poses, and
+    optionally on vectors, such as sensor constants. ``factors``: pairs of a factor and the keys of its variables."""
 
     def __init__(self, factors: Sequence[Placed]) -> None:
         keys = {key for _, of in factors for key in of}
@@ -141,7 +143,8 @@ class Chained:
 
     @property
     def fits(self) -> bool:
-        """True if each factor depends on one pose or on two consecutive poses, so that this class can solve the problem."""
+        """True if each factor depends on one pose or on two consecutive poses. Otherwise this class cannot solve the
+        problem."""
         place = {key: i for i, key in enumerate(self._poses)}
         for _, keys in self._factors:
             numbers = [place[key] for key in keys if key in place]
@@ -150,7 +153,8 @@ class Chained:
         return bool(self._poses)
 
     def begin(self, values: Values) -> State | None:
-        """Convert values by key to a state for the chain solver. Returns None if the vectors have too many components."""
+        """Convert ``values`` by key to a state: poses (N, 3), and all vectors joined to one array (P,). Returns None if
+        P is too large."""
         ends = np.cumsum([0, *(len(values[key]) for key in self._vectors)]).tolist()
         if ends[-1] > MOST_PARAMETERS:
             return None
@@ -162,7 +166,7 @@ class Chained:
         return np.array([values[key] for key in self._poses]), parameters
 
     def values(self, state: State) -> Values:
-        """Convert a state to values by key."""
+        """Convert a state from :meth:`begin` back to values by key."""
         poses, parameters = state
         vectors = {key: parameters[columns] for key, columns in self._columns.items()}
         return dict(zip(self._poses, poses, strict=True)) | vectors
@@ -171,7 +175,7 @@ class Chained:
         return sum(stack.cost(*state) for stack in self._stacks)
 
     def system(self, state: State) -> chain.System:
-        """Return the normal equations of the problem, linearised at a state."""
+        """Return the normal equations of the problem, linearised at a state from :meth:`begin`."""
         poses, parameters = state
         jacobian, residual = np.zeros((len(self._first), 6 + len(parameters))), np.zeros(len(self._first))
         begin = 0
@@ -183,7 +187,7 @@ class Chained:
 
     def moved(self, state: State, damping: float) -> tuple[State, float] | None:
         """Return the state after a Levenberg-Marquardt step, and the largest component of the step. Returns None if the
-        problem is nearly singular. ``damping``: relative to the diagonal of the Hessian."""
+        normal equations are nearly singular. ``damping``: relative to the diagonal of the Hessian."""
         try:
             is_solved, poses, parameters = chain.solved(self.system(state), damping)
         except np.linalg.LinAlgError:
@@ -194,7 +198,8 @@ class Chained:
         return (se2.compose(state[0], se2.exp(poses)), state[1] + parameters), float(largest)
 
     def covariances(self, values: Values) -> Covariances | None:
-        """Return the marginal covariances of all variables. None if this solver is not accurate enough for them."""
+        """Return the marginal covariances of all variables at ``values``. Returns None if this solver cannot compute
+        them accurately."""
         state = self.begin(values)
         if state is None:
             return None
@@ -228,15 +233,16 @@ class Chained:
 
 
 def _kind(factor: Factor, keys: tuple[int, ...]) -> Hashable:
-    """Return a key of a factor. Factors with equal keys are linearised together, a factor with the key None alone."""
+    """Return a key that groups factors. Factors with equal keys can be linearised together, a factor with the key None
+    alone."""
     kind = cast(Stackable, factor).kind if _is_stackable(type(factor)) else None
     return None if kind is None else (type(factor), kind, *[key for key in keys if not is_pose(key)])
 
 
 @cache
 def _is_stackable(kind: type[Factor]) -> bool:
-    """True if factors of a class can be combined to stacks. The result is cached, because the check takes longer than a
-    linearisation."""
+    """Return True if factors of a class can be linearised together. The result is cached, because the check takes
+    longer than a linearisation."""
     return hasattr(kind, "kind") and hasattr(kind, "stack")
 
 
@@ -276,14 +282,15 @@ class _Others:
 
 @dataclass(frozen=True)
 class Solution:
-    """A solution of a problem: the values of all variables, and the robust cost."""
+    """A solution of a least-squares problem. ``values``: the values of all variables by key. ``cost``: the sum of
+    robust losses."""
 
     values: Values
     cost: float
 
 
 class Problem:
-    """A nonlinear least-squares problem. ``factors``: the factors with the keys of their variables."""
+    """A nonlinear least-squares problem. ``factors``: pairs of a factor and the keys of its variables."""
 
     def __init__(self, factors: Sequence[tuple[Factor, tuple[int, ...]]]) -> None:
         self._factors = factors
@@ -295,7 +302,7 @@ class Problem:
         return chain if chain.fits else None
 
     def solve(self, values: Values, max_iterations: int = MAX_ITERATIONS) -> Solution:
-        """Return a local optimum near initial ``values``, or the best values after ``max_iterations``."""
+        """Return a local optimum near the initial ``values``, or the best solution after ``max_iterations``."""
         chain = self._chain
         begin = None if chain is None else chain.begin(values)
         if chain is not None and begin is not None:
@@ -324,7 +331,7 @@ class Problem:
         return {key: retract(key, value, step.at(key)) for key, value in values.items()}, largest
 
     def cost(self, values: Values) -> float:
-        """Return the robust cost at ``values``. It is infinite if the sum of the factors' costs is NaN."""
+        """Return the sum of robust losses at ``values``. It is infinite if a loss is NaN."""
         cost = sum(factor.cost(gather(values, keys)) for factor, keys in self._factors)
         return math.inf if math.isnan(cost) else cost
 

@@ -10,7 +10,7 @@ from factorgraph_loc.model.setup import MapUse
 
 
 class GraphSettings(FileModel):
-    """Settings of every graph estimator."""
+    """Settings that all estimators with a factor graph have."""
 
     max_delay: Annotated[float, Field(ge=0.0, le=4.0), InUnit("s")] = 0.5
     """largest delay of a measurement; later measurements are counted and ignored"""
@@ -22,12 +22,13 @@ class GraphSettings(FileModel):
 
 
 def _lag(value: Any, bounded: ValidatorFunctionWrapHandler) -> Any:
-    """Convert the value ``all`` of the setting ``lag`` to infinity, and check other values by ``bounded``."""
+    """Convert the value of the setting ``lag``: "all" to infinity, other values by the function ``bounded``, which
+    checks bounds."""
     return math.inf if value in ("all", math.inf) else bounded(value)
 
 
 def _written(lag: float | None) -> float | str | None:
-    """Return the value of the setting ``lag`` in files. Infinity is written as ``all``."""
+    """Return the value of the setting ``lag`` for a file. Infinity is written as ``all``."""
     return "all" if lag == math.inf else lag
 
 
@@ -56,4 +57,4 @@ class SmootherSettings(GraphSettings):
 
 
 class BatchSettings(GraphSettings):
-    """Settings of the batch estimator."""
+    """Settings of the estimator ``Batch``, which optimises the whole log at its end."""

@@ -68,8 +68,8 @@ class FullHistory:
         self._touched: Collection[int] = ()  # the keys of variables in the last update
 
     def update(self, nodes: Sequence[Node], values: Values, t: float) -> None:
-        """Add the factors ``nodes`` and new variables, and solve. ``values``: initial values of the new variables.
-        ``t`` [s]: the time of new poses."""
+        """Add the factors ``nodes`` and new variables, and solve. ``values``: initial values of the new variables by
+        key. ``t`` [s]: the time of the new poses."""
         self.begin((), nodes, values, {})
         touched = {key for node in nodes for key in node.keys}
         self._touched = () if any(map(is_point, touched)) else touched
@@ -82,19 +82,20 @@ class FullHistory:
         stamps: Mapping[int, float],
     ) -> None:
         """Add the first factors and variables to a new solver, and solve. ``factors``: of GTSAM, such as priors.
-        ``nodes``: factors of measurements. ``values``: initial values. ``stamps``: the time [s] of each variable."""
+        ``nodes``: factors of measurements. ``values``: initial values by key. ``stamps``: the time [s] of each variable
+        by key."""
         graph, removed = self._ours.added(self._isam, factors, nodes, values)
         self._ours.place(self._isam.update(graph, to_gtsam(values), removed).getNewFactorsIndices())
         self._touched = ()
 
     @property
     def oldest(self) -> int:
-        """The number of the oldest pose that a new solver would need after a failure."""
+        """The number of the oldest pose that is needed to rebuild the solver after a failure."""
         return 0
 
     def summary(self, *, failed: bool) -> MarginalSummary | None:
-        """Return the information of all variables that have left the solver, or None if none has left. ``failed``: True
-        if the last update failed, to return the information from before this update."""
+        """Return the marginal factors that replace the variables removed from the solver, or None if none was removed.
+        ``failed``: True if the last update failed. The factors from before this update are then returned."""
         return None
 
     def value(self, key: int) -> Array:
@@ -109,7 +110,7 @@ class FullHistory:
         return np.asarray(self._solver.marginalCovariance(key))
 
     def linear(self) -> tuple[gtsam.GaussianFactorGraph, dict[int, int]]:
-        """Return all factors, linearised, and the number of components of each variable by key."""
+        """Return all factors as one linear graph, and the number of components of each variable by key."""
         isam = self._solver if isinstance(self._solver, gtsam.ISAM2) else self._solver.getISAM2()
         at = isam.getLinearizationPoint()
         sizes = {key: 3 if is_pose(key) else len(at.atVector(key)) for key in at.keys()}  # noqa: SIM118
@@ -122,8 +123,8 @@ _State = tuple[gtsam.NonlinearFactorGraph, gtsam.Values, Values, frozenset[int]]
 
 
 class Window(FullHistory):
-    """A fixed-lag smoother: each update marginalises poses older than ``lag`` [s]. An update without such poses is
-    faster, because iSAM2 then puts the newest pose at the root of its elimination tree."""
+    """A fixed-lag smoother: each update marginalises poses that are older than ``lag`` [s]. An update without such
+    poses is faster, because iSAM2 then puts the newest pose at the root of its elimination tree."""
 
     _solver: gtsam.IncrementalFixedLagSmoother
 
@@ -181,8 +182,8 @@ class Window(FullHistory):
         return read(self._solver, key)
 
     def covariances(self, keys: Sequence[int]) -> dict[int, Array]:
-        """Return the marginal covariances of the variables ``keys``, by key, from one elimination of the window. Empty
-        if the elimination fails, or if a variable has left."""
+        """Return the marginal covariances of the variables ``keys``, by key. They are computed together by one
+        elimination. The result is empty if the elimination fails, or if a variable is no longer in the solver."""
         order = gtsam.Ordering()
         for key in keys:
             order.push_back(key)
@@ -231,9 +232,9 @@ def _holding(factors: Sequence[gtsam.NonlinearFactor], values: Values) -> dict[i
 class LinearFactors:
     """The factors of measurements in a solver, and the linearisation points of the solver's variables.
 
-    ``threshold``: variables that have changed by more are linearised again. ``skip``: the number of updates between two
-    checks of the changes. ``on_failure``: called with the reason if a factor cannot be linearised. This factor is left
-    out. A slot is the index of a factor in the solver's graph.
+    ``threshold``: variables that have changed by more are linearised again. ``skip``: the changes are checked at every
+    ``skip``-th update. ``on_failure``: called with the reason if a factor cannot be linearised. This factor is left
+    out.
     """
 
     def __init__(self, threshold: float, skip: int, on_failure: Callable[[str], None]) -> None:
@@ -257,8 +258,8 @@ class LinearFactors:
         """Prepare an update of the solver. Call :meth:`place` after the update.
 
         ``factors``: new factors of GTSAM. ``nodes``: new factors of measurements. ``values``: initial values of new
-        variables. Returns a graph of the factors to add, and the slots of the factors to remove. Factors on variables
-        that will be linearised again are replaced.
+        variables by key. Returns a graph of the factors to add, and the indices of the factors to remove from the
+        solver's graph. Factors on variables that will be linearised again are replaced.
         """
         self._updates += 1
         self._added = self._moved(solver) if self.at and not self._updates % self._skip else []
@@ -296,7 +297,7 @@ class LinearFactors:
         return gtsam.LinearContainerFactor(factor, to_gtsam({key: self.at[key] for key in keys}))
 
     def place(self, slots: Sequence[int]) -> None:
-        """Store the ``slots`` that the solver has given to the added factors."""
+        """Store ``slots``, the indices that the added factors have in the solver's graph after the update."""
         for linear in self._added:
             linear.slot = slots[linear.slot]
             self._slots.add(linear.slot)
@@ -313,7 +314,8 @@ class LinearFactors:
 
     @property
     def framed(self) -> Values:
-        """The linearisation points for a new solver. Variables of marginal factors keep their positions relative to each other."""
+        """The linearisation points for a new solver, by key. Variables with marginal factors keep their positions
+        relative to each other."""
         return self.at | self._held
 
     @property
@@ -337,7 +339,7 @@ class LinearFactors:
         return list({number: linear for key in anew for number, linear in self._on.get(key, {}).items()}.values())
 
     def _followed(self, estimates: Values) -> list[int]:
-        """Return the keys of the variables with factors that must be linearised again, () if the map is known.
+        """Return the keys of the variables with factors that must be linearised again, empty if the map is known.
         ``estimates``: the present estimates of all variables with a linearisation point that iSAM2 does not move."""
         if all(map(is_pose, estimates)):
             return []
@@ -364,9 +366,9 @@ _PLACED = attrgetter("node.factor", "node.keys", "node.rows")
 
 
 def project_out_gauge(jacobian: Array, motions: Array) -> Array:
-    """Return the matrix nearest to ``jacobian`` (m, n) that has a product of zero with ``motions``.
+    """Return the matrix nearest to ``jacobian`` (m, n) whose product with ``motions`` is zero.
 
-    ``motions`` (n, 3): the changes of the variables when the whole graph moves or rotates, from
+    ``motions`` (n, 3): the derivatives of the variables when the whole graph is translated or rotated, from
     :func:`factors.graph.frame_motions`. Source: Hesch, Kottas, Bowman, Roumeliotis, IEEE Transactions on Robotics
     30(1), 2014, section V.
     """

@@ -25,9 +25,10 @@ def oldest_pose(keys: Iterable[int]) -> int:
 
 @dataclass(frozen=True)
 class MarginalSummary:
-    """The information on the variables of a window from marginalised variables and priors, without measurements.
+    """The marginal factors that replace the removed (marginalised) variables of a fixed-lag smoother, and the priors.
 
-    ``factors``: marginal factors and priors. ``keys``, ``at``: the keys and linearisation points of all variables.
+    ``factors``: marginal factors and priors. ``keys``: the keys of the smoother's variables. ``at``: their
+    linearisation points by key.
     """
 
     factors: tuple[gtsam.NonlinearFactor, ...]
@@ -38,10 +39,10 @@ class MarginalSummary:
     def of(
         cls, graph: gtsam.NonlinearFactorGraph, points: gtsam.Values, at: Values, ours: Collection[int] = ()
     ) -> MarginalSummary:
-        """Return the summary of a solver's ``graph``.
+        """Return the marginal factors and priors in a solver's ``graph``.
 
-        ``points``: the linearisation points of iSAM2. ``at``: the linearisation points of the summary. ``ours``: the
-        indices of factors of measurements in ``graph``, which are left out.
+        ``points``: the linearisation points of iSAM2. ``at``: the linearisation points of the result. ``ours``: the
+        indices of the factors of measurements in ``graph``, which are left out.
         """
         every = (graph.at(i) for i in range(graph.size()) if i not in ours)
         values = to_gtsam(at)
@@ -63,12 +64,14 @@ class MarginalSummary:
         return oldest_pose(self.keys)
 
     def before_pose(self, pose: int) -> MarginalSummary:
-        """Return the summary without the poses from index ``pose`` on. Call this before their keys are used again."""
+        """Return the summary with the pose of index ``pose`` and later poses marginalised out. Call this before their
+        keys are used for new poses."""
         kept = frozenset(key for key in self.keys if not is_of_keyframe(key) or index_of(key) < pose)
         return MarginalSummary(tuple(self.on(kept)), kept, {key: self.at[key] for key in kept})
 
     def on(self, present: Collection[int]) -> list[gtsam.NonlinearFactor]:
-        """Return the factors of the summary on the variables ``present`` (keys), with all others marginalised out."""
+        """Return factors on only the variables ``present`` (keys). All other variables of the summary are marginalised
+        out."""
         kept: list[gtsam.NonlinearFactor] = []
         linear, gone, at = gtsam.GaussianFactorGraph(), set[int](), to_gtsam(self.at)
         for factor in self.factors:
@@ -88,10 +91,11 @@ class MarginalSummary:
 
 
 def is_missing(node: Node, present: Collection[int], known: Collection[int]) -> bool:
-    """True if a rebuilt window must get the factor ``node`` in addition to its summary.
+    """Return True if a rebuilt fixed-lag smoother needs the factor ``node`` in addition to its summary of removed
+    variables.
 
-    ``present``: the keys of the window's variables. ``known``: the keys of the summary's variables. The summary already
-    contains the priors of its variables except poses, and the factors on poses that have left.
+    ``present``: the keys of the smoother's variables. ``known``: the keys of the summary's variables. The summary
+    contains the priors of its variables except poses, and the factors on removed poses.
     """
     if any(key not in present for key in node.keys):
         return False
