@@ -239,7 +239,7 @@ def _of_tags(log: Log, options: MapOptions, progress: Progress) -> MadeMap:
 def _without_dead(log: Log, options: MapOptions, progress: Progress) -> MadeMap:
     """Return the log's map without its dead tags: tags that were not read although the smoother expected reads."""
     if options != MapOptions(drop_dead=True, prior=options.prior):
-        raise InputError("--drop-dead edits the log's map and maps nothing, expected no other option but --prior")
+        raise InputError("--drop-dead only removes dead tags from the log's map: remove all options but --prior")
     if "tags" not in _mappable(log) or not log.world.tags:
         raise InputError(f"{log.name}: has no reads or no map of tags, but --drop-dead requires both")
     result = run(log, RunConfig("smoother", prior=options.prior), progress)

@@ -42,7 +42,9 @@ def resolve_prior(log: Log, prior: str | None) -> tuple[PosePrior | None, str]:
         return None, prior
     if prior == "log":
         if log.start is None:
-            raise InputError(f"{log.name}: has no start pose: {SET_PRIOR} reference, X,Y,HEADING, X,Y or unknown")
+            raise InputError(
+                f"{log.name}: has no start pose: {SET_PRIOR} 'reference', 'X,Y,HEADING', 'X,Y' or 'unknown'"
+            )
         return PosePrior(log.start.t, np.array(log.start.pose), np.diag(np.square(log.start.sigmas))), prior
     if prior == "reference":
         return _from_reference(log), prior
@@ -71,12 +73,14 @@ def first_odometry(log: Log) -> float:
 def _from_reference(log: Log) -> PosePrior:
     """Return a prior at the first pose of the reference at or after the first odometry. Raises InputError without such a pose."""
     if log.reference is None:
-        raise InputError(f"{log.name}: has no reference to start from: {SET_PRIOR} log, X,Y,HEADING, X,Y or unknown")
+        raise InputError(
+            f"{log.name}: has no reference to start from: {SET_PRIOR} 'log', 'X,Y,HEADING', 'X,Y' or 'unknown'"
+        )
     start = first_odometry(log)
     first = int(np.searchsorted(log.reference.t, start))
     if first == len(log.reference):
         raise InputError(
-            f"{log.name}: its reference ends before the first odometry at {start:.3f} s: {SET_PRIOR} X,Y,HEADING or unknown"
+            f"{log.name}: its reference ends before the first odometry at {start:.3f} s: {SET_PRIOR} 'X,Y,HEADING' or 'unknown'"
         )
     t, pose = float(log.reference.t[first]), np.array(log.reference.poses[first])
     covariance = _covariance(REFERENCE_POSITION_SIGMA, REFERENCE_HEADING_SIGMA)

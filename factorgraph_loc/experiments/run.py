@@ -128,13 +128,13 @@ def _start(use: Use, config: RunConfig, estimator: Estimator, prior: PosePrior |
     if prior is None and not getattr(estimator, "supports_unknown_start", False):
         raise InputError(
             f"{config.estimator} cannot start from an unknown pose on {log.name} with these settings: "
-            f"{SET_PRIOR} reference, log or X,Y,HEADING"
+            f"{SET_PRIOR} 'reference', 'log' or 'X,Y,HEADING'"
         )
     finds = finds_heading(estimator) and detecting(log.world, use.sensors)
     if prior is not None and not prior.has_heading and not finds:
         raise InputError(
             f"{config.estimator} cannot find an unknown heading on {log.name} with these settings and sensors: "
-            f"{SET_PRIOR} X,Y,HEADING"
+            f"{SET_PRIOR} 'X,Y,HEADING'"
         )
     return _Start(prior, source)
 

@@ -52,8 +52,9 @@ FEWEST_FOUND, SHARE_FOUND = 12, 0.2  # relocalization: least number and least fr
 class Associations:
     """M matches between points of a map and features of an image.
 
-    ``points`` (M,): indices of the map's points. ``features`` (M,): indices of the image's features. ``expected``: the
-    number of points that should be visible. ``rejected``: the number of matches that were rejected as outliers.
+    ``points`` (M,): the index of the map point of each match. ``features`` (M,): the index of its feature in the image.
+    ``rejected``: the number of matches that were rejected as outliers. ``expected``: the number of map points that
+    should be visible in the image. Without a predicted pose, this is the number of matches before rejection.
     """
 
     points: Integers
@@ -69,7 +70,7 @@ NONE = Associations(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64))
 
 
 class Associator:
-    """Matches the features of images to the points of a map. ``feature``: the kind of the map's features."""
+    """Matches features of images to the points of a map. ``feature``: kind of the map's features, such as "sift"."""
 
     def __init__(self, points: PointMap, model: CameraModel) -> None:
         self.feature = points.feature
@@ -92,10 +93,11 @@ class Associator:
     def guided(
         self, frame: CameraFrame, camera: CameraPose, model: CameraModel | None = None, focal: float = 0.0
     ) -> Associations:
-        """Return the matches between the features of an image and the points of the map, by a predicted pose of the camera.
+        """Return the matches between features of an image and the map points that a camera at a predicted pose sees.
 
-        ``frame``: the features. ``camera``: the predicted pose. ``model``: the current estimate of the camera's calibration,
-        if it differs from the rig's. ``focal``: the standard deviation of the logarithm of the focal length.
+        ``frame``: the features. ``camera``: the predicted pose, with its covariance. ``model``: the current estimate of
+        the camera's calibration; None means the calibration of the rig. ``focal``: the standard deviation of the
+        logarithm of the focal length. The result is empty if the image has another kind of features than the map.
         """
         model = self._model if model is None else model
         position, rotation = camera.position, camera.rotation
@@ -134,9 +136,11 @@ class Associator:
         return Associations(ahead[rows[right]], matched_features[right], expected, int(np.count_nonzero(~right)))
 
     def _similar_views(self, points: Integers, place: Array) -> tuple[Integers, Integers]:
-        """Return those views of ``points`` (C,) that were seen from viewpoints similar to the camera position ``place`` (3,).
+        """Return the views of ``points`` (C,) from viewpoints similar to the camera position ``place`` (3,).
 
-        Returns the indices of these views, sorted by point, and the start of each point's views in this array (C+1,).
+        A view is an observation of a map point in an image from which the map was made. The first array (V,) has the
+        indices of the selected views, sorted by point. The second array (C + 1,) has the index in the first array where
+        the views of each point begin; its last value is V.
         """
         is_wanted = np.zeros(len(self._positions), dtype=bool)
         is_wanted[points] = True
@@ -152,7 +156,7 @@ class Associator:
         return views, np.append(np.searchsorted(self._owners[views], points), len(views))
 
     def relocalized(self, frame: CameraFrame) -> tuple[CameraPose, Associations] | None:
-        """Locate the camera of an image in the map without a prediction. Returns the camera pose and the matches.
+        """Return the pose of the camera in the map, estimated from one image without a prediction, and the matches.
 
         Returns None if too few features match for a reliable pose.
         """
@@ -172,9 +176,10 @@ class Associator:
         return resection.camera, associations
 
     def _match_descriptors(self, frame: CameraFrame) -> tuple[Integers, Integers]:
-        """Match features to points by their descriptors alone. Returns indices of points and of features.
+        """Return M matches by descriptors alone, as indices of map points (M,) and of features (M,).
 
-        The point and the feature of a match are mutually most similar, and pass the ratio test against all other points.
+        The point and the feature of a match have mutually the most similar descriptors. They also pass the ratio test
+        against all other points.
         """
         owners, descriptors = self._owners, self._descriptors
         if len(owners) > MANY:
@@ -196,8 +201,11 @@ class Associator:
         return np.asarray(distances(pairs, begins, views, self._numbers, _numbers(frame_descriptors)))
 
     def _cost_limit(self) -> float:
-        """Return the largest distance of descriptors that a match may have. Only the fraction :data:`CHANCE` of pairs
-        of different points is more similar."""
+        """Return the largest distance of descriptors that a match may have, squared unless descriptors are binary.
+
+        Only the fraction :data:`CHANCE` of the pairs of different map points has a smaller distance. The result is
+        infinite if the map is too small to estimate this.
+        """
         if len(self._starts) < 3 or len(self._owners) == 0:
             return math.inf
         rows = np.linspace(0, len(self._owners) - 1, min(SAMPLED, len(self._owners))).astype(np.int64)
@@ -214,9 +222,10 @@ def _numbers(descriptors: Descriptors) -> Float:
 
 
 def _gates(covariances: Array) -> tuple[Array, Array]:
-    """Return the elliptic gates of C predicted pixels with innovation ``covariances`` (C, 2, 2) [px^2].
+    """Return the elliptic gates of C predicted pixels.
 
-    Returns the matrices A (C, 2, 2) of the ellipses x'Ax = 1, and the largest radii (C,) [px].
+    Returns the matrices A (C, 2, 2) of the ellipses x'Ax = 1 around the pixels, and their largest radii (C,) [px].
+    ``covariances`` (C, 2, 2) [px^2]: of the innovations, measured minus predicted pixel.
     """
     gates = GATE * covariances
     mean = 0.5 * (gates[:, 0, 0] + gates[:, 1, 1])
@@ -229,11 +238,11 @@ def _gates(covariances: Array) -> tuple[Array, Array]:
 
 @compiled
 def gated_pairs(predicted: Array, inverses: Array, reaches: Array, features: Array, cell: float) -> Integers:
-    """Return the pairs (N, 2) of a point and a feature, as indices. The feature lies in the gate of the point.
+    """Return all pairs (N, 2) of a point and a feature in the gate of this point, as indices.
 
     ``predicted`` (C, 2) [px]: the predicted pixels of the points. ``inverses`` (C, 2, 2): the matrices A of the
     elliptic gates x'Ax = 1. ``reaches`` (C,) [px]: the largest radii of the gates. ``features`` (K, 2) [px]: the pixels
-    of the features. ``cell`` [px]: the features are sorted into grid cells of this size for speed.
+    of the features. ``cell`` [px]: the size of the cells of a grid that speeds up the search.
     """
     low_x, low_y = high_x, high_y = features[0, 0], features[0, 1]
     for i in range(1, len(features)):
@@ -280,11 +289,12 @@ def gated_pairs(predicted: Array, inverses: Array, reaches: Array, features: Arr
 
 @compiled(fastmath=True)
 def distances(pairs: Integers, begins: Integers, views: Integers, known: Any, frame_descriptors: Any) -> Array:
-    """Return the squared distances (N,) of N pairs between the descriptor of a feature and the most similar view of a
-    point. For binary descriptors these are Hamming distances.
+    """Return the squared distance (N,) between descriptors for N pairs of a map point and a feature.
 
+    A point has a descriptor from each image that shows it (a view). The distance to the most similar view counts.
     ``pairs`` (N, 2): indices of point and feature. ``views[begins[i]:begins[i + 1]]``: indices of the views of point i.
     ``known`` (V, D): the descriptors of the map's views. ``frame_descriptors`` (K, D): the descriptors of the features.
+    Binary descriptors have one number per bit, so that the result is the Hamming distance.
     """
     out = np.empty(len(pairs))
     size = known.shape[1]
@@ -306,10 +316,10 @@ def clear_pairs(
 ) -> Integers:
     """Return the indices of the pairs that are mutually best and pass the ratio test.
 
-    ``pairs`` (N, 2): indices of point and feature. ``costs`` (N,): distances of their descriptors. ``predicted`` (C,
-    2), ``features`` (K, 2) [px]: the pixels of points and features. The cost of a pair must be below ``ratio`` times
-    the cost of every other pair with the same point or feature. Other pairs less than ``apart`` [px] away are not
-    compared, because they may show the same point.
+    ``pairs`` (N, 2): indices of point and feature. ``costs`` (N,): distances of their descriptors. ``predicted``
+    (C, 2), ``features`` (K, 2) [px]: the pixels of points and features. The cost of a pair must be below ``ratio``
+    times the cost of every other pair with the same point or feature. Other pairs with a pixel less than ``apart`` [px]
+    away are exempt from the ratio test, because they may show the same point.
     """
     every = np.arange(len(pairs))
     kept = np.ones(len(pairs), dtype=bool)

@@ -36,7 +36,8 @@ class Weights:
     map: Float
 
     def __call__(self, values: Float) -> Float:
-        """Return the descriptors (N, 35), of unit length, of features with ``values`` (N, 35)."""
+        """Return descriptors (N, 35) of unit length. ``values`` (N, 35): see
+        :func:`~factorgraph_loc.vision.descriptor.values`."""
         mapped = (values - self.mean) @ self.map
         length = np.linalg.norm(mapped, axis=1, keepdims=True)
         return np.asarray(mapped / np.maximum(length, np.finfo(np.float32).tiny), dtype=np.float32)
@@ -76,8 +77,8 @@ class ColourExtractor:
         return keypoints, shipped_weights()(descriptor.values(described))
 
     def record(self, image: object) -> tuple[Keypoints, NDArray[np.void]]:
-        """Return the N features of ``image``, and their values (N,) as records of
-        :data:`~factorgraph_loc.vision.descriptor.RECORD`, before weights are applied."""
+        """Return the N features of ``image``, and their values before the multiplication by :class:`Weights`. The
+        values are a structured array (N,) of the type :data:`~factorgraph_loc.vision.descriptor.RECORD`."""
         space, keypoints = self._detect(image)
         if space is None:
             return keypoints, np.empty(0, dtype=descriptor.RECORD)
@@ -100,8 +101,8 @@ class ColourExtractor:
 
 
 def colour_channels(image: Image) -> list[Float]:
-    """Return the channels E (intensity), E_lambda and E_lambda_lambda (opponent colours), each (H, W), of a BGR image.
-    A grey image (H, W) has the channel E only."""
+    """Return the channels (H, W) of a BGR image (H, W, 3): E (intensity), E_lambda (yellow-blue), E_lambda_lambda
+    (red-green). A grey image (H, W) has the channel E only."""
     if image.ndim == 2:
         return [image.astype(np.float32)]
     channels = cv2.split(cv2.transform(image.astype(np.float32), _FROM_BGR))

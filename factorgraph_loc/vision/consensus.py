@@ -37,8 +37,8 @@ JOINT = 0.99  # probability of the joint compatibility test
 
 @dataclass(frozen=True)
 class CameraPose:
-    """The pose of a camera. ``position`` (3,), ``rotation`` (3, 3): in the world frame. ``covariance`` (6, 6): of a
-    perturbation in the camera frame, rotation first."""
+    """A camera pose. ``position`` (3,) [m]: in the world frame. ``rotation`` (3, 3): from the camera frame to the world
+    frame. ``covariance`` (6, 6): of a perturbation in the camera frame, rotation [rad] before translation [m]."""
 
     position: Array
     rotation: Array
@@ -46,9 +46,10 @@ class CameraPose:
 
 
 def are_compatible(model: CameraModel, camera: CameraPose, points: Array, pixels: Array, covariances: Array) -> bool:
-    """True if K observed points together pass a chi-square test (joint compatibility) with the predicted ``camera``.
+    """True if K observed points together pass a chi-square test against the predicted pose ``camera``.
 
-    ``points`` (K, 3): positions in the world frame. ``pixels`` (K, 2): observations. ``covariances`` (K, 2, 2) [px^2]: their noise.
+    ``points`` (K, 3) [m]: positions in the world frame. ``pixels`` (K, 2): the observed pixels. ``covariances``
+    (K, 2, 2) [px^2]: of the errors of these pixels, without the uncertainty of the pose.
     """
     arrays = (np.ascontiguousarray(part, dtype=float) for part in (points, pixels, covariances))
     try:
@@ -59,11 +60,10 @@ def are_compatible(model: CameraModel, camera: CameraPose, points: Array, pixels
 
 
 def agreeing(model: CameraModel, camera: CameraPose, points: Array, pixels: Array, covariances: Array) -> Truths:
-    """Return a mask (K,) of the observed points that agree on one pose near the predicted ``camera``.
+    """Return a mask (K,) of the observed points that agree on one camera pose near the predicted pose ``camera``.
 
-    ``points`` (K, 3): positions in the world frame. ``pixels`` (K, 2): observations. ``covariances`` (K, 2, 2) [px^2]:
-    their noise. All points are inliers if they are jointly compatible with the prediction (:func:`are_compatible`).
-    Otherwise at least :data:`FEWEST` points must agree, or none is an inlier.
+    ``points``, ``pixels``, ``covariances``: see :func:`are_compatible`. All points are inliers if they are jointly
+    compatible with the prediction. Otherwise at least :data:`FEWEST` points must agree, or none is an inlier.
     """
     count = len(points)
     if are_compatible(model, camera, points, pixels, covariances):
@@ -87,10 +87,11 @@ def agreeing(model: CameraModel, camera: CameraPose, points: Array, pixels: Arra
 def _best_of_samples(
     model: CameraModel, camera: CameraPose, points: Array, pixels: Array, whiteners: Array, root: Array
 ) -> tuple[Array, Array, Array]:
-    """Return the camera pose with most inliers among corrections of the predicted pose by random samples of points.
+    """Return the camera pose that agrees best with all points, among corrections by random samples of points.
 
     Returns the position (1, 3), the rotation (1, 3, 3), and the squared whitened residuals (K,) of all points.
-    ``whiteners`` (K, 2, 2): whiten the pixel errors. ``root`` (6, 6): a square root of the covariance of corrections.
+    ``camera``: the predicted pose. ``whiteners`` (K, 2, 2): matrices that whiten the pixel errors. ``root`` (6, 6): a
+    square root of the prior covariance of a correction.
     """
     rng, count = np.random.default_rng(0), len(points)
     best: tuple[float, Array, Array, Array] | None = None
@@ -130,7 +131,7 @@ def _joint(
     lens: Lens, position: Array, rotation: Array, covariance: Array, points: Array, pixels: Array, covariances: Array
 ) -> float:
     """Return the squared Mahalanobis distance of ``pixels`` (K, 2) from the predicted pixels of ``points`` (K, 3).
-    ``covariances`` (K, 2, 2): the noise of the pixels. ``covariance`` (6, 6): of the camera's perturbation."""
+    ``covariance`` (6, 6): of the camera pose, rotation first. ``covariances`` (K, 2, 2): of the pixel errors."""
     predicted, jacobian, _ = reprojection_kernels.linearize_in_space(lens, position, rotation, points)
     information, pull, total = np.zeros((6, 6)), np.zeros((6, 1)), 0.0
     for i in range(len(points)):
@@ -163,7 +164,8 @@ def _root(camera: CameraPose) -> Array:
 
 
 def _perturbed(position: Array, rotation: Array, step: Array) -> tuple[Array, Array]:
-    """Perturb H camera poses by ``step`` (H, 6), rotation first. Returns positions (H, 3) and rotations (H, 3, 3)."""
+    """Return positions (H, 3) and rotations (H, 3, 3) of H camera poses that are perturbed by ``step`` (H, 6). A
+    perturbation is in the camera frame, rotation first."""
     shifted = position + (rotation @ step[:, 3:, None])[..., 0]
     return shifted, rotation @ scipy.spatial.transform.Rotation.from_rotvec(step[:, :3]).as_matrix()
 
@@ -171,9 +173,10 @@ def _perturbed(position: Array, rotation: Array, step: Array) -> tuple[Array, Ar
 def _whitened(
     model: CameraModel, position: Array, rotation: Array, points: Array, pixels: Array, whiteners: Array
 ) -> tuple[Array, Array]:
-    """Return whitened residuals (H, 2S), predicted minus measured, of H cameras, and Jacobians (H, 2S, 6) by pose.
+    """Return the whitened pixel residuals (H, 2S), predicted minus measured, for H camera poses, and their Jacobians.
 
-    ``points`` (H, S, 3), ``pixels`` (H, S, 2), ``whiteners`` (H, S, 2, 2): S points of each camera.
+    The Jacobians (H, 2S, 6) are derivatives by a perturbation of the pose. ``points`` (H, S, 3), ``pixels`` (H, S, 2):
+    S observed points of each camera. ``whiteners`` (H, S, 2, 2): matrices that whiten the pixel errors.
     """
     count = len(position)
     local = (points - position[:, None]) @ rotation
@@ -187,8 +190,8 @@ def _whitened(
 def _squared(
     model: CameraModel, position: Array, rotation: Array, points: Array, pixels: Array, whiteners: Array
 ) -> Array:
-    """Return the squared whitened residuals (H, K) of K points for H cameras. ``whiteners`` (K, 2, 2): of the pixel
-    errors."""
+    """Return the squared whitened pixel residuals (H, K) of K points for H camera poses. ``whiteners`` (K, 2, 2):
+    matrices that whiten the pixel errors."""
     local = (points - position[:, None]) @ rotation
     predicted = reprojection.project(model, local.reshape(-1, 3)).reshape(*local.shape[:2], 2)
     error = np.einsum("kij,hkj->hki", whiteners, predicted - pixels)

@@ -43,11 +43,11 @@ _FLAT = 1e-6  # grey levels: norm of a patch's responses below which they are se
 
 
 def records(space: ScaleSpace, keypoints: Keypoints, *, paper_literal: bool = False) -> NDArray[np.void]:
-    """Compute the values of N ``keypoints`` of an image, as records (N,) of the type :data:`RECORD`.
+    """Return the values that describe N ``keypoints`` of an image, as records (N,) of the type :data:`RECORD`.
 
-    ``space``: the scale space of the image. ``keypoints`` must have directions. By default four places around a point
-    are described too. ``paper_literal``: describe the four nearest keypoints instead, as Raoui et al. 2011. The nearest
-    keypoints often differ between images, which makes the values less repeatable.
+    ``space``: the scale space of the image. ``keypoints`` must have directions. By default the values describe the
+    keypoint and four places around it. ``paper_literal``: describe the four nearest keypoints instead of the places, as
+    Raoui et al. 2011. The nearest keypoints often differ between images, which makes the values less repeatable.
     """
     sigmas = keypoints.sizes / 2.0
     answers = space.patches(keypoints.points, sigmas, keypoints.angles, LATTICE) @ FILTERS
@@ -68,7 +68,7 @@ def records(space: ScaleSpace, keypoints: Keypoints, *, paper_literal: bool = Fa
 
 
 def values(record: NDArray[np.void]) -> Float:
-    """Convert records (N,) to the 35 dimensionless values (N, 35) that are compared.
+    """Return the 35 dimensionless values (N, 35) of features that are compared. ``record`` (N,): see :func:`records`.
 
     Responses and textures are divided by their norm, for invariance to contrast. Scale is in octaves. Orientations are
     replaced by their sine, which is continuous where an angle wraps around.
@@ -81,8 +81,8 @@ def values(record: NDArray[np.void]) -> Float:
 
 
 def _nearest(points: Array) -> Integers:
-    """Return the indices (N, 4) of the four nearest other points of each of ``points`` (N, 2), nearest first. If there
-    are too few points, the index of the point itself is used."""
+    """Return the indices (N, 4) of the four nearest neighbours of each of ``points`` (N, 2), nearest first. If there
+    are too few neighbours, the index of the point itself is used."""
     indices = cKDTree(points).query(points, k=np.arange(2, 6))[1] if len(points) else np.empty((0, 4), dtype=np.int64)
     return np.where(indices < len(points), indices, np.arange(len(points))[:, None]).astype(np.int64)
 
@@ -92,14 +92,14 @@ def _unit(block: Float) -> Float:
 
 
 def cross(arm: float) -> Array:
-    """Return five places (5, 2) in the frame of a point: its origin, and one place on each diagonal at the distance ``arm``."""
+    """Return five places (5, 2) relative to a point: the origin, and one on each diagonal at the distance ``arm``."""
     angles = np.pi / 4.0 + np.pi / 2.0 * np.arange(4.0)
     return np.vstack([np.zeros(2), arm * np.stack([np.cos(angles), np.sin(angles)], axis=1)])
 
 
 def _gaussian(scale: float, centre: Array) -> tuple[Array, Array, float]:
-    """Return the weights (M,) of a Gaussian at the lattice places, their offsets (M, 2) from ``centre`` (2,), and the
-    variance. The variance is ``scale``**2 - 1, because the samples already have a blur with the variance 1."""
+    """Return the weights (M,) of a Gaussian at the M places of :data:`LATTICE`, their offsets (M, 2) from ``centre``
+    (2,), and the variance. It is ``scale``**2 - 1, because the samples already have a blur with the variance 1."""
     variance = scale**2 - 1.0
     away = LATTICE - centre
     return np.exp(-0.5 * (away**2).sum(axis=1) / variance) / (2.0 * np.pi * variance), away, variance
@@ -119,8 +119,8 @@ def _gradient(scale: float, centre: Array) -> list[Array]:
 
 
 def _gabor(wavelength: float, angle: float) -> list[Array]:
-    """Return the weights of a Gabor wavelet at the lattice places: real part, without its mean, and imaginary part.
-    ``angle`` [rad]: its direction."""
+    """Return the weights of a Gabor wavelet at the M places of :data:`LATTICE`, as two arrays (M,): the real part
+    without its mean, and the imaginary part. ``angle`` [rad]: direction of the wave."""
     x, y = LATTICE.T
     window = np.exp(-0.5 * (x**2 + y**2) / (ENVELOPE * wavelength) ** 2)
     window /= window.sum()

@@ -44,10 +44,10 @@ _WEIGHTS: Float = np.exp(-(_grid[1:-1, 1:-1] ** 2).sum(axis=2) / (2.0 * ORIENTAT
 
 
 def detect(space: ScaleSpace, colours: list[Float], count: int, *, everywhere: bool = False) -> Keypoints:
-    """Detect at most ``count`` points in an image. Returns them by descending response.
+    """Return the corners in an image, at most ``count``, by descending response.
 
-    ``space``: the scale space of the intensity E. ``colours``: the other channels (H, W) of the image. ``everywhere``:
-    choose points in all parts of the image, not only the strongest.
+    ``space``: the scale space of the image's intensity. ``colours``: the colour channels (H, W), empty for a grey
+    image. ``everywhere``: choose points in all parts of the image, not only the strongest.
     """
     corners = np.vstack(_corners(space, colours))
     corners = corners[np.argsort(-corners[:, 3], kind="stable")]
@@ -63,9 +63,10 @@ def detect(space: ScaleSpace, colours: list[Float], count: int, *, everywhere: b
 
 
 def orientations(space: ScaleSpace, points: Array, sigmas: Array) -> Array:
-    """Return the dominant gradient direction (N,) [rad], in (-pi, pi], of the intensity around points.
+    """Return the dominant direction (N,) [rad] of the intensity gradient around points, in (-pi, pi].
 
-    ``points`` (N, 2) [px]. ``sigmas`` (N,) [px]: the scales of the points.
+    ``space``: the scale space of the image. ``points`` (N, 2) [px]. ``sigmas`` (N,) [px]: the scales of the points. The
+    angle is counted from x (right) to y (down).
     """
     patches = space.patches(points, sigmas, np.zeros(len(points)), _OFFSETS)
     histograms = np.zeros((len(points), ORIENTATION_BINS), dtype=np.float32)
@@ -84,8 +85,8 @@ def orientations(space: ScaleSpace, points: Array, sigmas: Array) -> Array:
 
 
 def _corners(space: ScaleSpace, colours: list[Float]) -> list[Array]:
-    """Detect the corners of each characteristic scale. Returns an array (N, 4) for each scale: x and y [px], scale
-    [px], response."""
+    """Return the corners of each scale of an image, as an array (N, 4) for each scale. Its columns are x and y [px],
+    scale [px] and response."""
     by_scale = []
     for o, octave in enumerate(space.octaves):
         if o > 0:
@@ -102,8 +103,8 @@ def _corners(space: ScaleSpace, colours: list[Float]) -> list[Array]:
 
 
 def fill_strength(octave: Octave, i: int) -> None:
-    """Write the Harris measure at scale number ``i`` of an octave to ``octave.strength``. ``octave.colours`` must have
-    the blur of scale ``i - 1``."""
+    """Write the Harris corner measure at the scale ``SIGMAS[i]`` of an octave to ``octave.strength``.
+    ``octave.colours`` must already have the blur ``SIGMAS[i - 1]``."""
     structure_tensor(octave.planes[i - 1], octave.colours, octave.products)
     for product in octave.products:
         blur(product, product, INTEGRATION * SIGMAS[i])

@@ -33,7 +33,7 @@ class ImageFeatures:
 
 
 def encode(keypoints: Keypoints, descriptors: Descriptors) -> bytes:
-    """Encode features as bytes. Pixel coordinates are rounded to float32: the error is at most 0.001 px below 16384 px.
+    """Return features as bytes. Pixel coordinates are rounded to float32: the error is at most 0.001 px below 16384 px.
     Descriptors are stored without loss."""
     points = keypoints.points.astype("<f4")
     binary = descriptors.dtype == np.uint8
@@ -44,7 +44,7 @@ def encode(keypoints: Keypoints, descriptors: Descriptors) -> bytes:
 
 
 def decode(content: bytes) -> ImageFeatures:
-    """Decode the features that :func:`encode` encoded. Raises ValueError if ``content`` is something else."""
+    """Return the features that :func:`encode` encoded. Raises ValueError if ``content`` is something else."""
     if len(content) < _FEATURES.size:
         raise ValueError("these bytes are no features")
     count, columns, binary, fits = _FEATURES.unpack_from(content)
@@ -63,15 +63,16 @@ _MARK = b"FGLC"
 
 
 def cache_folder() -> Path:
-    """Return the folder that the environment variable ``FGLOC_CACHE`` names. If it is not set, return the user's cache folder."""
+    """Return the cache folder: the environment variable ``FGLOC_CACHE`` if it is set, else the user's cache folder."""
     folder_name = os.environ.get(VARIABLE)
     return Path(folder_name) if folder_name else platformdirs.user_cache_path("factorgraph-loc", appauthor=False)
 
 
 class FeatureCache:
-    """Stores the encoded features of each image in a file below ``folder``, by a key. Call :meth:`trim` to limit the total size.
+    """A cache on disk for the encoded features of images. The features of each image are a file below ``folder``.
 
-    ``fault``: an error message if the folder cannot be written, otherwise empty.
+    A key identifies an image and the method, and names the file. Call :meth:`trim` to limit the total size. ``fault``:
+    an error message after a file could not be written, otherwise empty.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -79,7 +80,7 @@ class FeatureCache:
         self.fault = ""
 
     def read(self, key: str) -> bytes | None:
-        """Return the content of a key, or None if it is missing or damaged. The time of the last use is set to now."""
+        """Return the bytes stored under ``key``, or None if they are missing or damaged. Their last use is now."""
         path = self._path(key)
         try:
             stored = read_bytes(path, DATA)
@@ -95,7 +96,8 @@ class FeatureCache:
         return content
 
     def write(self, key: str, content: bytes) -> None:
-        """Store ``content`` under a key, atomically. If it cannot be written, ``fault`` is set and no error is raised."""
+        """Store ``content`` under ``key``, atomically. If it cannot be written, no error is raised, but ``fault`` is
+        set."""
         if self.fault:
             return
         path = self._path(key)
@@ -107,7 +109,7 @@ class FeatureCache:
             self.fault = f"{self._folder}: cannot be written: {error.strerror}"
 
     def trim(self) -> None:
-        """Delete the least recently used contents until the size of the cache is at most :data:`LIMIT`."""
+        """Delete the least recently used files until the size of the cache is at most :data:`LIMIT`."""
         files = []  # without temporary files, which are still being written
         for path in self._folder.glob("*/[!.]*"):
             try:

@@ -48,8 +48,7 @@ class OpenCvExtractor:
         return keypoints[order], np.asarray(descriptors)[order]
 
     def _chosen(self, keypoints: Keypoints) -> Integers:
-        """Return the indices of the selected keypoints, by descending response, because OpenCV may return more than
-        ``count``."""
+        """Return the indices of at most ``count`` keypoints, by descending response. OpenCV may return more."""
         order = np.argsort(-keypoints.responses, kind="stable").astype(np.int64)
         if self._everywhere:
             return order[spread_out(keypoints.points[order], self._count, cells=PARTS)]
@@ -64,7 +63,7 @@ EXTRACTORS: dict[str, Callable[..., Extractor]] = {
 
 
 def extractor(name: str, count: int = 1000, *, everywhere: bool = False) -> Extractor:
-    """Create an extractor of features. ``name``: a key of :data:`EXTRACTORS`.
+    """Return a new extractor of features. ``name``: a key of :data:`EXTRACTORS`, such as "sift".
 
     ``count``: the largest number of features per image. ``everywhere``: choose features in all parts of an image, not
     only the strongest. Raises InputError for an unknown name or a ``count`` below 1.

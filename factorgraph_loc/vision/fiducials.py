@@ -27,9 +27,9 @@ MIN_CONTRAST = 20.0  # grey levels across an edge; an edge with less contrast is
 
 
 def refined_corners(grey: Image, corners: Array, bits: int) -> Array:
-    """Return the refined corners (4, 2) [px] of a marker in a ``grey`` image. A corner with poor or short edges is unchanged.
+    """Return the corners (4, 2) [px] of a marker, refined to subpixels. Corners at faint or short edges are unchanged.
 
-    ``corners`` (4, 2) [px]: the detected corners. ``bits``: the number of cells along a side, including the black border.
+    ``corners`` (4, 2) [px]: the detected corners. ``bits``: number of cells along a side, including the black border.
     """
     for _ in range(PASSES):
         corners = _intersections(grey, corners, bits)
@@ -37,8 +37,8 @@ def refined_corners(grey: Image, corners: Array, bits: int) -> Array:
 
 
 def _intersections(grey: Image, corners: Array, bits: int) -> Array:
-    """Fit a line to the edge near each side of the square ``corners`` (4, 2), and return the intersections of
-    neighbouring lines."""
+    """Return the corners (4, 2) [px] of a marker. They are intersections of lines that are fitted to the edges near the
+    sides of the square ``corners`` (4, 2)."""
     middle = corners.mean(axis=0)
     sides = np.linalg.norm(np.roll(corners, -1, axis=0) - corners, axis=1)
     reach = min(REACH, 0.8 * float(sides.min()) / bits)  # not across the black border
@@ -61,10 +61,10 @@ def _intersections(grey: Image, corners: Array, bits: int) -> Array:
 
 
 def _line(grey: Image, start: Array, end: Array, middle: Array, reach: float) -> tuple[Array, float] | None:
-    """Fit a line to an edge of a marker between ``start`` and ``end``. Returns None if the edge is not visible.
+    """Return the line n.p = c along an edge of a marker: the normal n (2,) and c [px]. None if the edge is not visible.
 
-    ``middle`` (2,): the centre of the marker. ``reach`` [px]: the largest distance of samples from the line between
-    ``start`` and ``end``. The result is the normal n (2,) and the offset c [px] of the line n.p = c.
+    ``start``, ``end`` (2,) [px]: the ends of the edge. ``middle`` (2,) [px]: the centre of the marker. ``reach`` [px]:
+    the largest distance of samples from the line between ``start`` and ``end``.
     """
     along = end - start
     length = float(np.linalg.norm(along))
@@ -101,10 +101,10 @@ def _line(grey: Image, start: Array, end: Array, middle: Array, reach: float) ->
 
 
 def find_markers(image: Image, family: MarkerFamily) -> list[tuple[int, Array]]:
-    """Detect the markers of a ``family`` in an image. Returns the number of each marker and its corners (4, 2) [px].
+    """Return the number and the corners (4, 2) [px] of each marker of a ``family`` that is detected in an image.
 
-    The order of the corners is upper left, upper right, lower right, lower left of the printed marker. A number that
-    occurs twice in the image is omitted, because it is not known which of both is meant.
+    The order of the corners is upper left, upper right, lower right, lower left of the printed marker. Markers with the
+    same number in one image are omitted, because at most one of them can be genuine.
     """
     grey = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)
     detector = _detector(family)

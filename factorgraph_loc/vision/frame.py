@@ -11,11 +11,11 @@ from factors.se2 import Array
 
 @dataclass(frozen=True, slots=True)
 class CameraFrame:
-    """The K features of one image. The arrays are empty if the image could not be read.
+    """A camera measurement: the K features of one image. The arrays are empty if the image could not be read.
 
-    ``t`` [s]: the time of the image. ``feature``: the kind of features, such as "sift".
+    ``t`` [s]: the time of the image. ``feature``: the kind of features, such as "sift". ``source``: name of the camera.
     ``pixels`` (K, 2) [px]: x right, y down, (0, 0) at the centre of the upper left pixel. ``descriptors`` (K, D).
-    ``tracks`` (K,): the number of each feature's track. Features of different images with the same number show the same point.
+    ``tracks`` (K,): a number for each feature. Features of different images with the same number show the same point.
     """
 
     sensor: ClassVar[str] = "camera"
@@ -31,7 +31,7 @@ class CameraFrame:
 
     @property
     def frame(self) -> "CameraFrame":
-        """This object. The property exists because other kinds of camera measurements have no features, and return None."""
+        """This object. Camera measurements without features have the value None for this property."""
         return self
 
     @property

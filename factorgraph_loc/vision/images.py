@@ -17,10 +17,10 @@ MIN_SIDE = 16  # px: smaller images have no features
 
 
 def as_image(array: object, source: object = "image") -> Image:
-    """Convert an image to a C-contiguous array of ``uint8``, (H, W) if it is grey or (H, W, 3) BGR.
+    """Return an image as a C-contiguous array of ``uint8``, (H, W) if it is grey or (H, W, 3) BGR.
 
-    ``array``: (H, W), (H, W, 1), (H, W, 3) BGR or (H, W, 4) BGRA. Alpha is dropped. ``uint16`` values from 0 to 65535 and
-    floating-point values from 0 to 1 are scaled to 0 to 255. ``source``: the origin of the image, for error messages.
+    ``array``: (H, W), (H, W, 1), (H, W, 3) BGR or (H, W, 4) BGRA. Alpha is dropped. ``uint16`` values from 0 to 65535
+    and floating-point values from 0 to 1 are scaled to 0 to 255. ``source``: the name of the image, for error messages.
     Raises InputError for an empty array, another shape or type, and values that are not finite or out of range.
     """
     if not isinstance(array, np.ndarray):
@@ -55,7 +55,7 @@ def is_blank(image: Image) -> bool:
 
 
 def read_image(path: Path) -> Image:
-    """Read an image file. Returns an array of ``uint8``, (H, W) or (H, W, 3) BGR.
+    """Return the image in a file as an array of ``uint8``, (H, W) or (H, W, 3) BGR.
 
     Raises InputError if the file is missing, cannot be decoded or has too many pixels.
     """
@@ -63,9 +63,9 @@ def read_image(path: Path) -> Image:
 
 
 def decoded(content: bytes, source: object, flags: int) -> NDArray[Any]:
-    """Decode the bytes of an image file with OpenCV. ``flags``: those of ``cv2.imdecode``. ``source``: the origin of
-    the bytes, for error messages.
+    """Return the pixels of an image file, decoded with OpenCV: (H, W) or (H, W, C).
 
+    ``content``: the bytes of the file. ``source``: its name, for error messages. ``flags``: see ``cv2.imdecode``.
     Raises InputError if the bytes are no image, or if it has more than :data:`~factorgraph_loc.files.bounded.PIXELS`
     pixels. This is checked before memory is allocated. OpenCV itself would allow 2^30 pixels.
     """

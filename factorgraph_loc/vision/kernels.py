@@ -27,8 +27,9 @@ FAST = {"contract", "reassoc"}
 def structure_tensor(intensity: Float, colours: Float, products: Float) -> None:
     """Compute the products of first derivatives of an image, summed over its channels.
 
-    ``intensity`` (H, W), ``colours`` (C, H, W): the channels. ``products`` (3, H, W): receives the sums of dx dx, dx dy and dy dy.
-    Derivatives are central differences. They are halved in the first and last row, and 0 in the first and last column.
+    ``intensity`` (H, W), ``colours`` (C, H, W): the channels. ``products`` (3, H, W): receives the sums of dx dx, dx dy
+    and dy dy. Derivatives are central differences, halved in the first and last row, and 0 in the first and last
+    column.
     """
     height, width = intensity.shape
     xx, xy, yy = products[0], products[1], products[2]
@@ -51,10 +52,10 @@ def structure_tensor(intensity: Float, colours: Float, products: Float) -> None:
 
 @compiled(nogil=True, fastmath=FAST)
 def corner_strength(products: Float, scale: np.float32, strength: Float) -> None:
-    """Compute the strength of corners: determinant over trace of the second moment matrix, times ``scale``. Without
-    ``scale`` this is half the harmonic mean of the eigenvalues.
+    """Compute the Harris corner measure of each pixel: determinant over trace of the second moment matrix.
 
-    ``products`` (3, H, W): the elements xx, xy, yy of the matrix at each pixel. ``strength`` (H, W): receives the result.
+    The measure is multiplied by ``scale``. Without it, it is half the harmonic mean of the eigenvalues. ``products``
+    (3, H, W): the elements xx, xy, yy of the matrix at each pixel. ``strength`` (H, W): receives the result.
     """
     xx, xy, yy = products[0], products[1], products[2]
     height, width = strength.shape
@@ -66,7 +67,7 @@ def corner_strength(products: Float, scale: np.float32, strength: Float) -> None
 
 @compiled(nogil=True)
 def _laplacian_near(plane: Float, y: int, x: int, weight: float) -> float:
-    """Return the largest absolute Laplacian of ``plane`` at the pixel (x, y) and its eight neighbours, times ``weight``."""
+    """Return the largest absolute Laplacian of ``plane`` at the pixel (x, y) and its neighbours, times ``weight``."""
     largest = 0.0
     for v in range(y - 1, y + 2):
         for u in range(x - 1, x + 2):
@@ -79,13 +80,14 @@ def _laplacian_near(plane: Float, y: int, x: int, weight: float) -> float:
 def refined_peaks(
     strength: Float, threshold: float, planes: Float, variances: Array, pixels: Int32, peaks: Array
 ) -> int:
-    """Select the local maxima of the corner strength that are also maxima over scale, and refine them. Returns their number.
+    """Select the local maxima of the corner strength that are also maxima over scale. Return their number.
 
     ``strength`` (H, W): the corner strength. ``pixels`` (N, 2): x and y of its local maxima. ``planes`` (3, H, W): the
-    intensity at three consecutive scales with ``variances`` (3,) [px^2]. A selected pixel has a strength above ``threshold``,
-    and the largest normalised Laplacian near it is in the middle plane.
-    ``peaks`` (N, 5): receives a row for each selected pixel. Its values are x and y, refined by a paraboloid through 3x3
-    strengths; the scale, refined by a parabola, in steps from the middle plane; the strength; the absolute Laplacian.
+    intensity at three consecutive scales with ``variances`` (3,) [px^2]. A selected pixel has a strength above
+    ``threshold``, and the largest normalised Laplacian near it is in the middle plane.
+
+    ``peaks`` (N, 5): receives a row for each selected pixel. Its values are x and y [px], refined by a paraboloid
+    through 3x3 strengths; the refined scale, in planes from the middle plane; the strength; the absolute Laplacian.
     """
     count = 0
     for n in range(len(pixels)):
@@ -120,10 +122,10 @@ def refined_peaks(
 
 @compiled(nogil=True)
 def locally_strongest(points: Float, scales: Float, reach: float, alike: float, most: int) -> Truths:
-    """Return a mask (N,) of the points that have no stronger point nearby. At most the first ``most`` such points are True.
+    """Return a mask (N,) of the points that have no stronger point nearby. Only the first ``most`` of them are True.
 
-    ``points`` (N, 2) [px]: sorted by descending strength. ``scales`` (N,) [px]: their scales. Nearby means: the distance is
-    less than ``reach`` times the point's scale, and the ratio of both scales is at most ``alike``.
+    ``points`` (N, 2) [px]: sorted by descending strength. ``scales`` (N,) [px]: their scales. Another point is nearby
+    if its distance is less than ``reach`` times the point's scale, and the ratio of both scales is at most ``alike``.
     """
     alone, count = np.zeros(len(points), np.bool_), 0
     for n in range(len(points)):
@@ -144,12 +146,12 @@ def locally_strongest(points: Float, scales: Float, reach: float, alike: float, 
 
 @compiled(nogil=True, fastmath=FAST)
 def sample_patches(planes: Float, starts: Int64, shapes: Int64, frames: Float, offsets: Float, patches: Float) -> None:
-    """Sample rotated and scaled patches around N points by bilinear interpolation. Each point has its own plane of a pyramid.
+    """Sample rotated and scaled patches around N points by bilinear interpolation, each in its own plane of a pyramid.
 
-    ``planes`` (T,): the pixels of all planes, row by row. ``starts`` (N,): index of the first pixel of each point's plane.
-    ``shapes`` (N, 2): height and width of the plane. ``frames`` (N, 4) [px]: x and y of the point in its plane, and the x axis
-    (a, b) of the patch's frame. ``offsets`` (M, 2): the sampled places in this frame. ``patches`` (N, M): receives the
-    samples. Outside the plane the nearest pixel is used.
+    ``planes`` (T,): the pixels of all planes, row by row. ``starts`` (N,): index of the first pixel of each point's
+    plane. ``shapes`` (N, 2): height and width of the plane. ``frames`` (N, 4) [px]: x and y of the point in its plane,
+    and the x axis (a, b) of the patch's frame. The length of this axis is the unit of ``offsets`` (M, 2), the sampled
+    places in this frame. ``patches`` (N, M): receives the samples. Outside the plane the nearest pixel is used.
     """
     for n in range(len(frames)):
         start, height, width = starts[n], shapes[n, 0], shapes[n, 1]

@@ -46,7 +46,7 @@ class Keypoints:
 
     @classmethod
     def from_cv2(cls, keypoints: Sequence[cv2.KeyPoint]) -> Keypoints:
-        """Convert keypoints of OpenCV. Its angle of -1 degrees means that a keypoint has no direction."""
+        """Return keypoints of OpenCV as this class. OpenCV's angle of -1 degrees means that there is no direction."""
         if not keypoints:
             return cls.empty()
         rows = np.array([(*k.pt, k.size, k.angle, k.response) for k in keypoints], dtype=float)
@@ -54,7 +54,7 @@ class Keypoints:
         return cls(rows[:, :2], rows[:, 2], angles, rows[:, 4])
 
     def to_cv2(self) -> list[cv2.KeyPoint]:
-        """Convert to OpenCV's keypoints."""
+        """Return these points as keypoints of OpenCV."""
         degrees = np.where(np.isnan(self.angles), -1.0, np.degrees(self.angles) % 360.0)
         columns = (*self.points.T, self.sizes, degrees, self.responses)
         return list(map(cv2.KeyPoint, *(column.tolist() for column in columns)))
@@ -72,19 +72,18 @@ class Extractor(Protocol):
         """Return the features of ``image``."""
 
     def detectAndCompute(self, image: object) -> tuple[Keypoints, Descriptors]:  # noqa: N802 (as OpenCV)
-        """Return the N features of ``image`` and their descriptors. These are bits, (N, bytes) ``uint8``, or numbers,
-        (N, D) ``float32``."""
+        """Return the N features of ``image`` and the descriptors: bits (N, bytes) ``uint8``, or (N, D) ``float32``."""
 
 
 PARTS = 12  # grid cells for features in all parts of an image: with more cells, very weak features would be chosen
 
 
 def spread_out(pixels: Array, count: int, priority: Sequence[int] | None = None, cells: int | None = None) -> Integers:
-    """Select at most ``count`` pixels that are spread over the image. Returns their indices in ascending order.
+    """Return the indices of at most ``count`` pixels that are distributed over the image, in ascending order.
 
-    ``pixels`` (K, 2). The pixels are divided into the cells of a grid. One pixel is taken from each cell in turn, until
-    there are enough. ``cells``: the approximate number of cells, ``count`` if None. ``priority`` (K,): pixels with a
-    higher priority are taken first in their cell. None means the order of ``pixels``.
+    ``pixels`` (K, 2) [px]: divided into the cells of a grid. One pixel is taken from each cell in turn, until there are
+    enough. ``cells``: the approximate number of cells, ``count`` if None. ``priority`` (K,): pixels with a higher
+    priority are taken first in their cell. None means the order of ``pixels``.
     """
     if len(pixels) <= count:
         return np.arange(len(pixels))

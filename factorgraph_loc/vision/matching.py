@@ -47,7 +47,7 @@ def match(
     ratio: float = RATIO,
     allowed: Truths | None = None,
 ) -> Matches:
-    """Match the descriptors ``first`` (N, D) with the descriptors ``second`` (M, D).
+    """Return the matches between the descriptors ``first`` (N, D) and the descriptors ``second`` (M, D).
 
     Two descriptors match if each is the nearest neighbour of the other. In addition their distance must be below
     ``ratio`` times the distance to the second nearest one in ``second``, if there is one. Ties are no matches.
@@ -72,12 +72,12 @@ def match(
 
 
 def gates(predicted: Array, covariances: Array, points: Array) -> Truths:
-    """Return a mask (N, M) of the measured pixels that lie in the gate of each predicted pixel. It can be passed to
-    :func:`match` as ``allowed``.
+    """Return a mask (N, M) that is true if a measured pixel lies in the gate of a predicted pixel.
 
-    ``predicted`` (N, 2) [px]: predicted pixels. ``covariances`` (N, 2, 2) [px^2]: of prediction and measurement together.
-    ``points`` (M, 2) [px]: measured pixels. A gate is the ellipse that contains the pixel with the probability :data:`GATE`.
-    The gate of a prediction that is NaN is empty. Raises InputError if a covariance is not positive definite.
+    A gate is the ellipse that contains the measured pixel with the probability :data:`GATE`. The mask can be passed to
+    :func:`match` as ``allowed``. ``predicted`` (N, 2) [px]: predicted pixels. ``covariances`` (N, 2, 2) [px^2]: of the
+    difference between predicted and measured pixel. ``points`` (M, 2) [px]: measured pixels. The gate of a prediction
+    that is NaN is empty. Raises InputError if a covariance is not positive definite.
     """
     a, b, c = covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]
     determinant = a * c - b * b
@@ -103,7 +103,8 @@ def nearest_neighbours(distances: Array) -> tuple[Integers, Array, Array]:
 
 
 def _is_clear(best: Array, second: Array) -> Truths:
-    """Return a mask of the neighbours that are nearer (``best``) than the ``second`` ones by more than rounding errors."""
+    """Return a mask (N,) of the nearest neighbours that are nearer than the second nearest by more than rounding
+    errors. ``best``, ``second`` (N,): the distances of both."""
     return np.asarray(second > (1.0 + ROUNDING) * best)
 
 

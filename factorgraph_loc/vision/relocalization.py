@@ -43,7 +43,7 @@ NEAREST = 20  # number of keyframes that an image is compared with
 
 @dataclass(frozen=True)
 class Resection:
-    """A camera pose computed from K points. ``inliers`` (K,): mask of the points that agree with the pose."""
+    """A pose ``camera`` computed from K points. ``inliers`` (K,): mask of the points that agree with the pose."""
 
     camera: CameraPose
     inliers: Truths
@@ -53,7 +53,8 @@ class Resection:
 class FoundOnFloor:
     """The pose of a robot on the floor, computed from K points.
 
-    ``pose`` (3,): x, y and heading. ``covariance`` (3, 3): in the robot's frame. ``inliers`` (K,): mask of the points that agree.
+    ``pose`` (3,): x, y [m] and heading [rad]. ``covariance`` (3, 3): of a perturbation in the robot's frame.
+    ``inliers`` (K,): mask of the points that agree with the pose.
     """
 
     pose: Array
@@ -62,10 +63,10 @@ class FoundOnFloor:
 
 
 def located(model: CameraModel, points: Array, pixels: Array, covariances: Array | None = None) -> Resection | None:
-    """Compute the camera pose from K points with outliers. Returns None if the points do not determine it.
+    """Return the camera pose computed from K observed points, without a prediction. Outliers are rejected.
 
-    ``points`` (K, 3): positions in the world frame. ``pixels`` (K, 2): their observed pixels. ``covariances`` (K, 3, 3)
-    [m^2]: of the positions, None if these are exact.
+    ``points`` (K, 3) [m]: positions in the world frame. ``pixels`` (K, 2): their observed pixels. ``covariances``
+    (K, 3, 3) [m^2]: of the positions, None if these are exact. Returns None if the points do not determine the pose.
     """
     if len(points) < FEWEST:
         return None
@@ -91,10 +92,10 @@ def located(model: CameraModel, points: Array, pixels: Array, covariances: Array
 def on_floor(
     model: CameraModel, camera: CameraPose, points: Array, pixels: Array, covariances: Array | None = None
 ) -> FoundOnFloor | None:
-    """Compute the planar pose of a robot on the floor by least squares. ``camera``: the initial pose of its camera.
+    """Return the planar pose of a robot on the floor by least squares. ``camera``: the initial pose of its camera.
 
-    ``points`` (K, 3), ``pixels`` (K, 2), ``covariances`` (K, 3, 3): see :func:`located`. Returns None if the robot with
-    this camera pose is tilted or not on the floor. Also returns None if the points do not determine the planar pose.
+    ``points`` (K, 3), ``pixels`` (K, 2), ``covariances`` (K, 3, 3): see :func:`located`. Returns None if this camera
+    pose means a tilted robot or one above the floor. Also returns None if the points do not determine the planar pose.
     """
     position, rotation = reprojection.carrier(model, camera.position, camera.rotation)
     tilt = math.acos(float(np.clip(rotation[2, 2], -1.0, 1.0)))
@@ -153,7 +154,7 @@ def _refined(
 def found_on_floor(
     model: CameraModel, points: Array, pixels: Array, covariances: Array | None = None
 ) -> FoundOnFloor | None:
-    """Compute the planar pose of a robot on the floor from K points with outliers, without a prediction.
+    """Return the planar pose of a robot on the floor from K observed points, without a prediction, and reject outliers.
 
     Arguments: see :func:`located`. Returns None if the points do not determine a pose on the floor.
     """
@@ -172,10 +173,10 @@ def found_on_floor(
 
 
 class KeyframeIndex:
-    """An index of the keyframes of a map, to find those that are most similar to an image.
+    """An index of the keyframes of a map, to find the keyframes that are most similar to an image.
 
-    ``descriptors`` (M, D): the descriptors of the map's M views. ``seen_from`` (M, 3): the camera position of each
-    view. All views with the same camera position form a keyframe.
+    A keyframe is an image from which the map was made. ``descriptors`` (M, D): of all M features in these images.
+    ``seen_from`` (M, 3): the camera position of each feature's image. Equal camera positions mean the same keyframe.
     """
 
     def __init__(self, descriptors: Descriptors, seen_from: Array) -> None:
@@ -192,16 +193,18 @@ class KeyframeIndex:
         return len(self._descriptions)
 
     def views(self, descriptors: Descriptors) -> Integers:
-        """Return the indices of the views of the :data:`NEAREST` keyframes most similar to an image with
-        ``descriptors`` (N, D)."""
+        """Return the indices of all descriptors of the :data:`NEAREST` keyframes that are most similar to an image with
+        the ``descriptors`` (N, D)."""
         (description,) = self._vlad_vectors(as_numbers(descriptors), np.zeros(len(descriptors), dtype=np.int64))
         alike = np.zeros(len(self), dtype=bool)
         alike[np.argsort(-(self._descriptions @ description), kind="stable")[:NEAREST]] = True
         return np.flatnonzero(alike[self._of])
 
     def _vlad_vectors(self, values: Array, of: Integers) -> Array:
-        """Return the VLAD vectors (K, WORDS * D) of K images. Similar images have similar vectors. ``values`` (M, D):
-        descriptors of all images. ``of`` (M,): the index of each descriptor's image."""
+        """Return the VLAD vectors (K, WORDS * D) of K images. Similar images have similar vectors.
+
+        ``values`` (M, D): descriptors of all images. ``of`` (M,): the index of each descriptor's image.
+        """
         (nearest, _), count = vq(values, self._words), len(self._words)
         descriptions = np.zeros((int(of.max()) + 1, count, values.shape[1]))
         np.add.at(descriptions, (of, nearest), values - self._words[nearest])
@@ -211,7 +214,7 @@ class KeyframeIndex:
 
 
 def as_numbers(descriptors: Descriptors) -> Array:
-    """Convert descriptors to floating-point numbers. Each bit of a binary descriptor becomes a number."""
+    """Return descriptors as floating-point numbers. Each bit of a binary descriptor (``uint8``) becomes a number."""
     if descriptors.dtype == np.uint8:
         descriptors = np.unpackbits(descriptors, axis=1)
     return np.asarray(descriptors, dtype=float)

@@ -25,11 +25,11 @@ SIGMAS: Array = FINEST * STEP ** np.arange(-1.0, SCALES + 1.0)
 
 @dataclass(frozen=True, eq=False)
 class Octave:
-    """The arrays of one octave.
+    """The arrays of one octave of a scale space.
 
-    ``planes`` (6, H, W): the intensity E at each scale of :data:`SIGMAS`. ``colours`` (C, H, W): the other channels at
-    one scale. ``products`` (3, H, W), ``strength`` (H, W), ``largest`` (H, W): work arrays of the detector.
-    ``step`` [px]: the size of a pixel of the octave, in pixels of the image.
+    ``planes`` (6, H, W): the intensity of the image, blurred to each scale of :data:`SIGMAS`. ``colours`` (C, H, W):
+    the colour channels at one scale. ``products`` (3, H, W), ``strength`` (H, W), ``largest`` (H, W): work arrays of
+    the detector. ``step`` [px]: the size of a pixel of the octave, in pixels of the image.
     """
 
     planes: Float
@@ -49,7 +49,7 @@ class Octave:
 class ScaleSpace:
     """The scale space of an image. Each octave has half the size of the previous one, down to a side of 16 px.
 
-    ``shape``: height and width of the images. ``colours``: the number of channels in addition to the intensity E.
+    ``shape``: height and width of the images. ``colours``: the number of colour channels in addition to the intensity.
     """
 
     def __init__(self, shape: tuple[int, ...], colours: int) -> None:
@@ -70,7 +70,7 @@ class ScaleSpace:
         self._steps: Array = np.array([2.0**o for o, _ in levels])
 
     def fill(self, intensity: Float) -> None:
-        """Compute the planes of all octaves from the intensity E, ``intensity`` (H, W)."""
+        """Compute the planes of all octaves from the ``intensity`` (H, W) of an image."""
         blur(intensity, self.octaves[0].planes[0], SIGMAS[0])
         for o, octave in enumerate(self.octaves):
             if o > 0:
@@ -79,16 +79,17 @@ class ScaleSpace:
                 blur(octave.planes[i - 1], octave.planes[i], more_blur(SIGMAS[i - 1], SIGMAS[i]))
 
     def levels(self, sigmas: Array) -> Integers:
-        """Return the index (N,) of the characteristic scale nearest to each of ``sigmas`` (N,) [px], counted over all
-        octaves."""
+        """Return the index (N,) of the characteristic scale nearest to each of ``sigmas`` (N,) [px]. The indices begin
+        at the finest scale and continue over all octaves."""
         nearest = np.rint(SCALES * np.log2(sigmas / FINEST))
         return np.asarray(np.clip(nearest, 0, len(self._steps) - 1), dtype=np.int64)
 
     def patches(self, points: Array, sigmas: Array, angles: Array, offsets: Float) -> Float:
-        """Sample the intensity E around N points. Returns the samples (N, M).
+        """Return samples (N, M) of the intensity at M places around each of N points.
 
-        ``points`` (N, 2) [px]. ``sigmas`` (N,) [px]: the scales of the points. ``offsets`` (M, 2): the sampled places around each
-        point, in units of its scale and along axes rotated by ``angles`` (N,) [rad]. Outside the image the nearest pixel is used.
+        ``points`` (N, 2) [px]. ``sigmas`` (N,) [px]: the scales of the points. ``offsets`` (M, 2): the sampled places
+        around each point, in units of its scale and along axes rotated by ``angles`` (N,) [rad]. Outside the image the
+        nearest pixel is used.
         """
         levels = self.levels(sigmas)
         steps = self._steps[levels]
@@ -107,5 +108,5 @@ def blur(source: Float, target: Float, sigma: float) -> None:
 
 
 def more_blur(have: float, want: float) -> float:
-    """Return the standard deviation of the blur that an image with blur ``have`` needs to have the blur ``want``."""
+    """Return the standard deviation [px] of the Gaussian that increases a blur of ``have`` [px] to ``want`` [px]."""
     return float(np.sqrt(want**2 - have**2))

@@ -25,8 +25,8 @@ OTHER_BODY = 0.5  # pairs of a second essential matrix are kept if they exceed t
 
 
 class _TrackedImage(NamedTuple):
-    """The K features of one image. ``directions`` (K, 2): x and y at depth 1. ``numbers`` (K,): the numbers of their
-    tracks."""
+    """The K features of one image. ``directions`` (K, 2): normalised image coordinates, which are x and y at depth 1.
+    ``numbers`` (K,): the numbers of their tracks."""
 
     directions: Array
     descriptors: Descriptors
@@ -36,7 +36,7 @@ class _TrackedImage(NamedTuple):
 class FeatureTracker:
     """Assigns track numbers to the features of consecutive images. Features with the same number show the same point.
 
-    The images must be passed in order of time. The last two images are stored. Not thread-safe.
+    Pass the images in order of time. A track may miss one image, but not two in succession. Not thread-safe.
     """
 
     def __init__(self, camera: CameraModel) -> None:
@@ -46,7 +46,7 @@ class FeatureTracker:
         self._count = 0  # number of tracks
 
     def follow(self, pixels: Array, descriptors: Descriptors) -> Integers:
-        """Return the track numbers (K,) of the features of the next image, with ``pixels`` (K, 2) and ``descriptors`` (K, D).
+        """Return the track numbers (K,) of the K features of the next image. ``pixels`` (K, 2), ``descriptors`` (K, D).
 
         A number occurs at most once per image. A feature without a match gets a new number.
         """
@@ -64,8 +64,8 @@ class FeatureTracker:
         return numbers
 
     def _continue_tracks(self, earlier: _TrackedImage, image: _TrackedImage) -> _TrackedImage:
-        """Match the features of ``image`` that have no number yet with an earlier image, and write their track numbers.
-        Returns the features of the earlier image that were not matched."""
+        """Match the features of ``image`` without a track number with an ``earlier`` image, and write their numbers.
+        Return the features of the earlier image that were not matched."""
         rows = np.flatnonzero(image.numbers < 0)
         current = image.directions[rows], image.descriptors[rows]
         matched = pairs(earlier[:2], current, self._camera)
@@ -75,10 +75,10 @@ class FeatureTracker:
 
 
 def pairs(first: tuple[Array, Descriptors], second: tuple[Array, Descriptors], camera: CameraModel) -> Integers:
-    """Match the features of two images. Returns pairs (M, 2) of indices of a feature of the first and of the second image.
+    """Return the matches between the features of two images, as pairs (M, 2) of indices in the first and second image.
 
-    ``first``, ``second``: the features of an image, as directions (K, 2), which are x and y at depth 1, and descriptors (K,
-    D). ``camera``: its calibration.
+    ``first``, ``second``: the features of an image. They are normalised image coordinates (K, 2), x and y at depth 1,
+    and descriptors (K, D). ``camera``: the calibration of the camera.
     """
     if len(first[0]) == 0 or len(second[0]) == 0:
         return np.empty((0, 2), dtype=np.int64)
@@ -102,7 +102,7 @@ def pairs(first: tuple[Array, Descriptors], second: tuple[Array, Descriptors], c
 def _of_one_geometry(first: Float, second: Float, focal: float) -> Truths:
     """Return a mask (M,) of the pairs of pixels that fit one essential matrix. All are True if none can be estimated.
 
-    ``first``, ``second`` (M, 2) [px]: relative to the principal point. ``focal`` [px]: the focal length.
+    ``first``, ``second`` (M, 2) [px]: pixels relative to the principal point. ``focal`` [px]: the focal length.
     """
     matrix = np.diag((focal, focal, 1.0))
     try:

@@ -145,7 +145,7 @@ def test_dead_tags_are_dropped_and_named(fgloc, refused, room_on_disk, room, tmp
     assert read_world(out).tags == tags
     assert (tmp_path / "new.map.png").exists()
     other = tmp_path / "other.world.toml"
-    assert "--drop-dead edits the log's map" in refused("map", folder, "--drop-dead", "--extend", "-o", other)
+    assert "--drop-dead only removes dead tags" in refused("map", folder, "--drop-dead", "--extend", "-o", other)
 
 
 def test_without_reference_and_map_the_frame_is_the_start(fgloc, room_on_disk, tmp_path):

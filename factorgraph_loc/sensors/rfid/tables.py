@@ -170,7 +170,8 @@ def _require_all(inventories: TableRows) -> None:
     first, rows = int(inventories.rows.min(initial=2)), inventories.rows
     if first > 2 or np.any(rows != np.arange(first, first + len(rows))):
         raise InputError(
-            f"{inventories.path}: rows are skipped or sorted, but reads refer to rows by number: remove the reads' column inventory"
+            f"{inventories.path}: some rows were skipped or sorted, but the reads refer to these rows by row number: "
+            "correct the rows, or remove the column 'inventory' from the reads"
         )
 
 
