@@ -34,8 +34,8 @@ Columns = Mapping[str, slice]  # the indices of each block in the vector of the 
 
 @dataclass(frozen=True)
 class Term:
-    """A factor of the graph that depends on one pose and on blocks of the state. ``blocks``: the names of the blocks.
-    ``rows``: the number of residuals."""
+    """A factor of the graph on one robot pose and on named blocks of the state, such as the position of a landmark.
+    ``blocks``: the names of these blocks. ``rows``: the dimension of the residual."""
 
     factor: Factor
     blocks: tuple[str, ...]
@@ -45,8 +45,9 @@ class Term:
 class Observation(Protocol):
     """A measurement, or a part of one, as a constraint on one pose and on blocks of the state (such as a landmark).
 
-    ``t``: time of the measurement [s]. ``found``: number of detections, possibly 0. ``is_judged``: True if the
-    estimator must call :meth:`Sensor.judge`. ``iterations``: number of linearisations; None if the estimator decides.
+    ``t``: time of the measurement [s]. ``found``: number of detections or measured values, possibly 0. ``is_judged``:
+    True if the estimator must ask :meth:`Sensor.judge` before it applies the observation. ``iterations``: number of
+    linearisations of each correction; None if the estimator decides.
     """
 
     @property
@@ -59,15 +60,15 @@ class Observation(Protocol):
     def found(self) -> int: ...
     @property
     def work(self) -> int:
-        """Approximate time to compute the likelihood of one pose, as a multiple of the time for one RFID tag."""
+        """The approximate time to compute the likelihood of one pose. The unit is the time that one RFID tag needs."""
 
     @property
     def things(self) -> frozenset[Hashable]:
-        """Identifiers of the detected elements of the map, such as landmarks or tags."""
+        """The identifiers of the detected map elements, such as the indices of tags in the map. Possibly empty."""
 
     @property
     def terms(self) -> Sequence[Term]:
-        """The observation as factors of a graph."""
+        """The graph factors that represent the observation, each with the names of the blocks that it depends on."""
 
     @property
     def blocks(self) -> tuple[str, ...]:
@@ -76,32 +77,31 @@ class Observation(Protocol):
     def correct(
         self, pose: Array, covariance: Array, values: Blocks, columns: Columns, iterations: int = 1
     ) -> Correction:
-        """Return the Kalman correction of a Gaussian estimate of the pose and the blocks by this observation.
-
-        ``pose`` (3,), ``values``: the mean. ``covariance`` (S, S): the covariance of the error state. Its first three
-        components are the body-frame perturbation of the pose. ``columns``: the indices of each block in the error
-        state. ``iterations``: the number of linearisations.
-        """
+        """Return the Kalman correction of a Gaussian estimate of the pose and the blocks by this observation. ``pose``
+        (3,) and ``values``, the value (d,) of each block by name: the mean. ``covariance`` (S, S): that of the error
+        state. The first three components of the error state are the body-frame perturbation of the pose. ``columns``:
+        the indices of each block in the error state. ``iterations``: the number of linearisations."""
 
     def log_likelihood(self, poses: Array, values: Blocks) -> Array:
-        """Return the log-likelihood (N,) of ``poses`` (N, 3), up to a constant. ``values``: the value (N, P) of each
-        block at these poses. Calibration constants that are missing in ``values`` are taken from the rig."""
+        """Return the log-likelihood (N,) of ``poses`` (N, 3), up to a constant. ``values``: the values (N, P) of each
+        block by name, one row per pose. Calibration constants that are missing in ``values`` are taken from the rig."""
 
     def on_pose(self, values: Blocks, spreads: Blocks) -> Observation:
-        """Return an observation that depends on the pose only, with all blocks fixed at ``values``. Its noise includes
-        the uncertainty of the blocks. ``spreads``: their covariances (d, d) by name."""
+        """Return an observation that depends on the pose only. ``values``: the estimates (d,) of all blocks by name.
+        ``spreads``: their covariances (d, d) by name, which are added to the noise."""
 
     def at_its_time(self) -> Observation | None:
-        """Return an observation that depends only on the pose at the time ``t``, or None if this is impossible."""
+        """Return an observation that depends on the pose at its time ``t`` alone, or None if this is impossible."""
 
 
 @dataclass(frozen=True)
 class NewVariable:
     """A new block of the state: the position of a landmark that is seen for the first time, or a variable with a prior.
 
-    ``mean`` (d,): the initial estimate. ``by_pose`` (d, 3): its Jacobian by the pose. ``by_block``: its Jacobians
-    (d, P) by other blocks. ``noise`` (d, d): the covariance of ``mean`` if the pose and the other blocks were exact.
-    ``sightings``: times [s] and observations that give the estimate. If empty, ``mean`` and ``noise`` are a prior.
+    ``mean`` (d,): the initial estimate. ``by_pose`` (d, 3): its Jacobian by the body-frame perturbation of the pose.
+    ``by_block``: its Jacobians (d, P) by other blocks. ``noise`` (d, d): its covariance if the pose and the other
+    blocks were exact. ``sightings``: times [s] and observations that give ``mean``. If empty, ``mean`` and ``noise``
+    are a prior.
     """
 
     name: str
@@ -112,8 +112,8 @@ class NewVariable:
     sightings: tuple[tuple[float, Observation], ...]
 
     def joint(self, covariance: Array, columns: Columns) -> tuple[Array, Array]:
-        """Return the cross-covariance (d, S) of the block with an error state, and the covariance (d, d) of the block.
-        ``covariance`` (S, S): of the error state. ``columns``: the indices of each other block in the error state."""
+        """Return the cross-covariance (d, S) of this block with the error state, and the covariance (d, d) of this
+        block. ``covariance`` (S, S): that of the error state. ``columns``: the indices of other blocks in it."""
         jacobian = np.zeros((len(self.mean), len(covariance)))
         jacobian[:, :3] = self.by_pose
         for name, block in self.by_block.items():
@@ -134,8 +134,8 @@ class EarlierPose:
 
 @dataclass(frozen=True)
 class Link:
-    """A factor on the robot's poses at the times ``t`` and ``earlier`` [s], in this order. ``t``: the time of the
-    measurement. ``earlier``: the time of a pose that :meth:`View.earlier` returned. ``rows``: number of residuals."""
+    """A factor on two robot poses: first the pose at ``t`` [s], then the pose at ``earlier`` [s]. ``t``: the time of
+    the measurement. ``earlier``: a time that :meth:`View.earlier` returned. ``rows``: dimension of the residual."""
 
     t: float
     earlier: float
@@ -149,8 +149,9 @@ class Binding:
 
     ``setup``: rig, map and sensors of the run. ``motion``: the odometry. ``diagnostics``: receives the innovations.
     ``use``: "known" to use the landmarks of the map, "extended" to estimate further landmarks, "unknown" to estimate
-    all landmarks. ``points``: the same for image points, and for landmarks with range alone or bearing alone.
-    ``calibration``: which constants are estimated. ``name``: "" unless the rig has several sensors of this type.
+    all landmarks. ``points``: the same choice for image points and for landmarks with range alone or bearing alone.
+    ``calibration``: the constants to estimate, "particles" for those that may differ between particles. ``name``: the
+    name of the sensor if the rig has several of its type, otherwise "".
     """
 
     setup: Setup
@@ -183,28 +184,26 @@ class View(Protocol):
     @property
     def covariance(self) -> Array: ...
     def value(self, name: str) -> Array | None:
-        """Return the estimate (d,) of a block, or None if the estimator has no such block."""
+        """Return the estimate (d,) of the block ``name`` of the state, or None if the state has no such block."""
 
     def block_covariance(self, name: str) -> Array:
-        """Return the covariance (d, d) of a block that exists."""
+        """Return the covariance (d, d) of the block ``name``, which must exist in the state."""
 
     def joint(self) -> tuple[Array, Columns]:
-        """Return the covariance (S, S) of the error state, and the indices of each block in the error state."""
+        """Return the covariance (S, S) of the error state of pose and blocks, and the indices of each block in it."""
 
     def poses_at(self, times: Array) -> Array:
-        """Return the poses (R, 3) that the odometry gives at ``times`` (R,) [s], relative to the pose at ``t``."""
+        """Return the robot's poses (R, 3) at ``times`` (R,) [s] by odometry, in the robot frame at the time ``t``."""
 
     def earlier(self, t: float) -> EarlierPose | None:
-        """Return the last pose at or before ``t`` [s] that a :class:`Link` may depend on. Returns None if the estimator
-        keeps no such pose. Filters always return None."""
+        """Return the last pose at or before ``t`` [s] that a :class:`Link` may depend on. Returns None if the state
+        contains no such pose. Filters always return None."""
 
 
 class Finder(Protocol):
     """Global localization by one sensor: finds the pose without a prior, at the start or after the robot was carried.
-
-    ``start``: the known start position, or None. With it, only the heading is sought. ``at_once``: True if one
-    measurement can be enough.
-    """
+    ``start``: the known start position, or None. With it, only the heading is sought. ``at_once``: True if a single
+    measurement can determine the pose."""
 
     start: KnownPosition | None
 
@@ -213,41 +212,41 @@ class Finder(Protocol):
 
     @property
     def newest(self) -> ChainState | None:
-        """The odometry state at the last informative measurement, or None."""
+        """The odometry state at the last measurement that gave information, or None before the first one."""
 
     @property
     def hypotheses(self) -> Sequence[Mode]:
-        """Hypotheses of the pose at the last informative measurement, most likely first."""
+        """Possible poses at the last informative measurement, with weights and covariances, most likely first."""
 
     @property
     def best(self) -> PosePrior | None:
-        """The pose at the last informative measurement if it is unambiguous, otherwise None."""
+        """The pose at the last informative measurement with its covariance, or None if the pose is ambiguous."""
 
     def look(self, m: Any, odometry: ChainState) -> bool:
-        """Process ``m``, measured at the odometry state ``odometry``. Returns False if ``m`` gives no information."""
+        """Update ``hypotheses`` and ``best`` with the measurement ``m``. ``odometry``: the odometry state at the time
+        of ``m``. Returns False if ``m`` gives no information."""
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
         """Return ``count`` random poses (N, 3) at the last informative measurement, drawn from ``hypotheses``."""
 
     def follow(self, observation: Any, odometry: ChainState, view: View) -> None:
-        """Store an observation for :meth:`refuted_since`. ``view``: the estimate before the observation corrects it."""
+        """Store an observation for :meth:`refuted_since`. ``odometry``: the odometry state at the time of the
+        observation. ``view``: the estimate before the observation corrects it."""
 
     def refuted_since(self, m: Any, odometry: ChainState, pose: Array, covariance: Array) -> float | None:
-        """Return the time [s] since which the estimated pose has been wrong, or None if the estimate may be right.
-
-        Call this after an estimator has processed the measurement ``m``. ``pose`` (3,) with body-frame ``covariance``
-        (3, 3): the estimate at ``odometry``. If it is wrong, ``best`` is the correct pose.
-        """
+        """Return the time [s] since which the estimated pose has been wrong, or None if the estimate may be right. Call
+        this after an estimator has processed the measurement ``m``. ``odometry``: the odometry state at the time of
+        ``m``. ``pose`` (3,) with body-frame ``covariance`` (3, 3): the estimate at this time. If it is wrong, the
+        attribute ``best`` becomes the correct pose."""
 
     def clear(self) -> None:
-        """Discard the stored observations, because the estimated pose was replaced or confirmed."""
+        """Discard the observations of :meth:`follow`. Call this when the estimated pose was replaced or confirmed."""
 
 
 class Sensor:
-    """Base class of exteroceptive sensors. An object belongs to one run. Subclasses override the methods they need.
-
-    ``name``: the name of the sensor, by default ``modality``. The state block of its constants has the same name.
-    """
+    """Base class of exteroceptive sensors. Construct one object for each run. Subclasses override the methods they
+    need. ``name``: the name of the sensor, by default ``modality``. Its calibration constants are a block of the state
+    with this name."""
 
     modality: ClassVar[str]  # the kind of the sensor's measurements, such as "rfid"
     lost: ClassVar[str] = ""  # the reason in the message if this sensor rejects the estimated pose
@@ -255,25 +254,24 @@ class Sensor:
     follows_constants: ClassVar[bool] = False  # True if `observe` needs the covariance of the constants
     keyframe_every: ClassVar[float] = 0.09  # s between the keyframes of a graph
     gathers: ClassVar[bool] = False  # True if a graph must merge the observations of each keyframe by `gathered`
-    links: ClassVar[bool] = False  # True if the sensor yields `Link` objects, of which many may be false
+    links: ClassVar[bool] = False  # True if the sensor yields `Link` objects. Many may be false
     evidence_every: ClassVar[float] = 1.0  # s between the measurements that a global localization uses
     work: int = 10  # approximate time to add a measurement to a graph, relative to one RFID tag
     solve_every: float = 0.0  # s; a graph with new measurements is solved after at most this time
     finder: Finder | None = None  # localizes the robot without a prior
-    bounds: Array | None = None  # (2, 2) [m]: two corners of the area in which particles search for the robot
+    bounds: Array | None = None  # (2, 2) [m]: two corners of the area where particles search
 
     def __init__(self, name: str = "") -> None:
         self.name = name or self.modality
 
     def observe(self, m: Any, view: View) -> Iterator[Observation | NewVariable | Link]:
-        """Yield the observations of a measurement. The estimator applies each before it requests the next."""
+        """Yield the observations of the measurement ``m``. ``view``: the current estimate. The estimator applies each
+        yielded object before it requests the next."""
         raise NotImplementedError
 
     def judge(self, observation: Any, correction: Correction, view: View) -> bool:
-        """Return False if an observation must be rejected, otherwise True. Also record its innovation.
-
-        ``correction``: the result of :meth:`Observation.correct`. ``view``: the estimate before the correction.
-        """
+        """Return False if the estimator must reject ``observation``, otherwise True. Also record its innovation.
+        ``correction``: the result of :meth:`Observation.correct`. ``view``: the estimate before the correction."""
         return True
 
     def evidence(self, m: Any) -> Observation | None:
@@ -296,29 +294,29 @@ class Sensor:
         return False
 
     def accept(self) -> None:
-        """Reset ``suspicious_since``. The estimator calls this if global localization finds no better pose, because the
-        sensor's model or the map must then be wrong."""
+        """Reset ``suspicious_since``. Call this if a global localization has found no better pose, so that the sensor's
+        model or the map must be wrong."""
 
     def gathered(self, observations: Sequence[Any]) -> list[Term]:
-        """Return the graph factors of several observations that depend on the same pose, merged into few factors."""
+        """Return the graph factors of observations of the same pose. A subclass may merge them into fewer factors."""
         return [term for observation in observations for term in observation.terms]
 
     def at_end(self, factor: Factor, width: float) -> Factor | None:
         """Return the factor that replaces ``factor`` when the whole graph is solved after a run, or None to omit it.
-
-        ``width``: multiplies the scale of the robust loss. It exceeds 1 in the first steps of graduated non-convexity.
-        """
+        ``width``: factor on the scale of the robust loss. It exceeds 1 in the first steps of graduated
+        non-convexity."""
         return factor
 
     def convex_width(self, factor: Factor, values: Sequence[Array]) -> float:
-        """Return the smallest ``width`` of :meth:`at_end` that makes the loss of ``factor`` convex at ``values``."""
+        """Return the smallest ``width`` of :meth:`at_end` that makes the loss of ``factor`` convex at its variables
+        ``values``."""
         return 1.0
 
     def rewind(self, t: float) -> None:
-        """Undo the effects of all measurements after ``t`` [s], because the estimator processes them once more."""
+        """Undo the effects of all measurements after ``t`` [s]. The estimator will process these measurements again."""
 
     def restart(self, t: float) -> None:
-        """Reset the sensor, because the estimator starts again with a new pose at ``t`` [s]."""
+        """Reset the sensor. Call this when the estimator replaces its estimate by another pose at ``t`` [s]."""
 
 
 WORK = 20  # computing time of one residual and its robust loss, relative to one RFID tag
@@ -327,9 +325,7 @@ WORK = 20  # computing time of one residual and its robust loss, relative to one
 @dataclass(frozen=True)
 class ResidualObservation:
     """An observation that consists of residual factors (:class:`~factors.sighting.SightingFactor`) of one sensor.
-
-    ``log_likelihood`` evaluates one pose after the other. Override it if the sensor must be fast with particles.
-    """
+    ``t``: its time [s]. ``terms``: the factors. Limitation: ``log_likelihood`` evaluates one pose after the other."""
 
     t: float
     terms: tuple[Term, ...]

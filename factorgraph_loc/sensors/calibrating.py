@@ -52,9 +52,9 @@ class SensorKnowledge:
     ``sections``: the new sections of the rig by name.
     ``constants``: the fitted constants.
     ``notes``: warnings.
-    ``figures``: values for the report by name, as JSON types.
+    ``figures``: numbers and texts of the calibration report by name, as JSON types.
     ``residuals``: the residuals of each log.
-    ``details``: data of a subclass of :class:`Calibrator` for its plots.
+    ``details``: data for :meth:`Calibrator.pictures`, of a type that the subclass defines.
     ``correlations``: a tuple for each pair of strongly correlated constants: both names and the correlation.
     """
 
@@ -72,7 +72,7 @@ class Calibrator:
 
     ``section``: the section of the rig that is calibrated.
     ``channel``: the stream that a log must have.
-    ``senses``: True for exteroceptive sensors.
+    ``senses``: True for exteroceptive sensors, False for odometry.
     ``first``: initial settings for rigs without the section.
     """
 
@@ -84,18 +84,18 @@ class Calibrator:
     def learn(
         self, traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path | None, like: SensorKnowledge | None = None
     ) -> SensorKnowledge:
-        """Estimate the sensor's constants and noise from logs with trajectories.
+        """Return the sensor's constants and noise, estimated from logs with trajectories.
 
         ``traced``: the logs. ``rig``: the rig with initial values. ``first``: the rig before the first iteration, if
-        logs without references are smoothed and calibrated in turns. ``grids``: path and name prefix of files that may
-        be written, or None. ``like``: an earlier result with more logs. Its discrete choices, such as the type of the
-        sensor model, are kept. Raises InputError if a log is too short.
+        smoothing of logs and calibration alternate. ``grids``: path and name prefix of files that may be written, or
+        None. ``like``: an earlier result with more logs, or None. Its discrete choices, such as the type of the sensor
+        model, are used again. Raises InputError if a log is too short.
         """
         raise NotImplementedError
 
     def with_priors(self, rig: Rig, first: Rig) -> Rig:
-        """Return ``rig`` with the uncertainties of its constants replaced by those of ``first``. If logs are smoothed
-        and calibrated in turns, smaller learnt uncertainties would keep the constants near their last values."""
+        """Return ``rig`` with the uncertainties of the sensor's constants from ``first``. Use this if smoothing of logs
+        and calibration alternate, because smaller uncertainties would keep the constants near their last values."""
         if not hasattr(rig.section(self.section), "uncertainty"):
             return rig
         uncertainty = first.section(self.section).uncertainty
@@ -107,11 +107,11 @@ class Calibrator:
         return rig.section(self.section) or self.first
 
     def is_complete(self, rig: Rig) -> bool:
-        """True unless ``rig`` uses the sensor but lacks its section."""
+        """Return False if ``rig`` uses the sensor but has no section for it, otherwise True."""
         return self.channel not in rig.sensors or rig.section(self.section) is not None
 
     def pictures(self, _knowledge: SensorKnowledge) -> Sequence[Part]:
-        """Return additional plots of the sensor for the calibration report."""
+        """Return additional plots for the calibration report. ``_knowledge``: the result of :meth:`learn`."""
         return ()
 
 
@@ -129,7 +129,7 @@ class OneOfSeveral(Calibrator):
     def learn(
         self, traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path | None, like: SensorKnowledge | None = None
     ) -> SensorKnowledge:
-        """Estimate the sensor's constants and noise. See :meth:`Calibrator.learn`."""
+        """Return the sensor's constants and noise. For the arguments see :meth:`Calibrator.learn`."""
         kind, name = self._calibrator.section, self.section
         alone = [
             replace(
@@ -161,28 +161,29 @@ class ConstantsCalibrator(Calibrator):
     rounds: ClassVar[int] = 2
 
     def part(self, log: Log) -> Any:
-        """Return the data of one log. Raises InputError if the log has too few measurements."""
+        """Return the measurements of a log as an object with timestamps ``t`` (K,) [s] and a method
+        ``residuals(settings)``. Raises InputError if the log has too few measurements."""
         raise NotImplementedError
 
     def parameters(self, parts: Sequence[Any], settings: Any) -> Sequence[Parameter]:
-        """Return the constants to estimate, with priors around their values in ``settings``. ``parts``: the data of
-        each log."""
+        """Return the constants to estimate, with priors around their values in ``settings``. ``parts``: the result of
+        :meth:`part` for each log."""
         raise NotImplementedError
 
     def with_noise(self, parts: Sequence[Any], settings: Any) -> tuple[Sequence[Any], Any]:
-        """Estimate the noise from the residuals at the constants in ``settings``. Returns ``parts``, the data of each
-        log, and ``settings``, both updated with the estimated noise."""
+        """Return ``parts`` and ``settings``, both updated with noise that is estimated from the residuals. ``parts``:
+        the result of :meth:`part` for each log. ``settings``: they contain the constants for these residuals."""
         return parts, settings
 
     def finished(self, _parts: Sequence[Any], _rig: Rig, knowledge: SensorKnowledge) -> SensorKnowledge:
-        """Return the result ``knowledge``, to which a subclass adds noise or plots. ``_parts``: the data of each log.
-        ``_rig``: the rig with the estimated constants."""
+        """Return the result of the calibration. Subclasses add noise or plots to ``knowledge``, the fitted constants.
+        ``_parts``: the result of :meth:`part` for each log. ``_rig``: the rig with the estimated constants."""
         return knowledge
 
     def learn(
         self, traced: Sequence[Traced], rig: Rig, first: Rig, _grids: Path | None, _like: SensorKnowledge | None = None
     ) -> SensorKnowledge:
-        """Estimate the sensor's constants and noise by least squares. See :meth:`Calibrator.learn`."""
+        """Return the sensor's constants and noise, estimated by least squares. See :meth:`Calibrator.learn`."""
         if self.channel not in traced[0].log.streams:
             return SensorKnowledge()
         if traced[0].constants is not None:
@@ -200,11 +201,9 @@ class ConstantsCalibrator(Calibrator):
         return self.finished(parts, rig.model_copy(update=dict(knowledge.sections)), knowledge)
 
     def estimated(self, parts: Sequence[Any], settings: Any) -> tuple[Sequence[Any], Any, Posterior | None]:
-        """Return maximum a posteriori estimates of constants and noise. ``parts``: the data of each log.
-
-        Returns ``parts`` and ``settings``, both updated with the estimates, and the posterior of the constants. The
-        posterior is None if no constants are estimated.
-        """
+        """Return maximum a posteriori estimates of constants and noise. ``parts``: the result of :meth:`part` for each
+        log. ``settings``: initial values. Returns ``parts`` and ``settings``, both updated with the estimates, and the
+        posterior of the constants. The posterior is None if no constants are estimated."""
         parameters = self.parameters(parts, settings)
         start = {p.name: p.mean for p in parameters}
         posterior = None
@@ -228,7 +227,8 @@ class ConstantsCalibrator(Calibrator):
         self, parts: Sequence[Any], settings: Any, initial: Any, posterior: Posterior
     ) -> list[FittedConstant]:
         """Return the fitted constants of ``posterior``. With several logs, the uncertainty of a constant comes from the
-        differences between fits of single logs. ``initial``: the settings before the fit."""
+        differences between fits of single logs. ``initial``: the settings before the fit. ``parts``, ``settings``: the
+        results of :meth:`estimated`."""
         values = posterior.as_dict()
         own = centred(posterior.parameters, values)
         alone = [

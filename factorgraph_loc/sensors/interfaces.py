@@ -74,7 +74,8 @@ class Ending:
 
 @dataclass(frozen=True)
 class Review:
-    """A sensor's judgement of a finished run: ``warnings``, and the ``reliability`` of the sensor's model or None."""
+    """A sensor's assessment of a finished run: ``warnings``, and the ``reliability`` of the sensor's model
+    (None: unknown)."""
 
     warnings: tuple[Notice, ...] = ()
     reliability: Reliability | None = None
@@ -122,8 +123,9 @@ class Summary:
 def line(name: str, shift: float, than: str, setting: str, offset: float) -> Notice:
     """Return a warning that the timestamps of the stream ``name`` are ``shift`` [s] later than those of ``than``.
 
-    The warning proposes to set ``time_offset`` to ``offset`` [s] in the section ``setting`` of the rig. If ``shift`` is
-    the largest that was tried, the warning proposes to correct ``clock_offset`` in the manifest.
+    A negative ``shift`` means earlier. The warning proposes to set ``time_offset`` to ``offset`` [s] in the section
+    ``setting`` of the rig. If ``shift`` is the largest that was tried, it proposes to correct ``clock_offset`` in the
+    manifest.
     """
     if abs(shift) > FARTHEST - STEP:
         sentence = (
@@ -139,7 +141,7 @@ def line(name: str, shift: float, than: str, setting: str, offset: float) -> Not
 
 
 def in_other_case(names: Iterable[str], in_map: Iterable[str]) -> list[str]:
-    """Return the ``names`` that differ from a name of ``in_map`` only in upper and lower case."""
+    """Return the ``names`` that differ from a name in the map, ``in_map``, only in upper and lower case."""
     mapped = set(in_map)
     known = {name.casefold() for name in mapped}
     return [name for name in names if name not in mapped and name.casefold() in known]
@@ -166,7 +168,8 @@ class Marks:
 
 
 def marks(log: Log) -> list[Marks]:
-    """Return the marks of each map layer of ``log``. Detections of one layer by several sensors are merged."""
+    """Return the elements of each map layer of ``log`` and their detections, for plots. Each layer occurs once, with
+    the detections by all sensors."""
     layers: dict[str, Marks] = {}
     for name, draw in functions("draw", log.rig):
         new: Marks = draw(log.alone(name))
@@ -193,7 +196,7 @@ class Ride:
     rng_of_world: Callable[[str], np.random.Generator]
 
     def times(self, rate: float) -> Array:
-        """Return the times (N,) [s] at which a sensor with ``rate`` [Hz] measures during the drive."""
+        """Return the times (N,) [s] of the measurements of a sensor with ``rate`` [Hz] during the drive."""
         return times(rate, self.truth)
 
 
@@ -226,7 +229,7 @@ class LiveSensor(Protocol):
 
 
 def times(rate: float, truth: Trajectory) -> Array:
-    """Return the times (N,) [s] at which a sensor with ``rate`` [Hz] measures during the trajectory ``truth``."""
+    """Return the times (N,) [s] of the measurements of a sensor with ``rate`` [Hz] during the trajectory ``truth``."""
     count = int(float(truth.t[-1]) * rate + 1e-9)
     return np.asarray(np.minimum(np.arange(1, count + 1) / rate, truth.t[-1]))
 
@@ -243,15 +246,16 @@ class Forecast(Protocol):
         """Return the expected Fisher information (N, 3, 3) of the measurements at each pose of a path.
 
         The information is that on the body-frame perturbation of the pose. ``poses`` (N, 3): the poses of the path.
-        ``ways`` (N,): the length [m] of the path segment that ends at each pose. Turns count by their duration, as the
-        length that the robot drives in that time.
+        ``ways`` (N,): the length [m] of the path segment that ends at each pose. A turn on the spot counts as the
+        distance that the robot would drive in the same time.
         """
 
     def add_log_weights(self, poses: Array, metres: float, stops: Places, seed: np.uint64, out: Array32) -> None:
-        """Simulate measurements of the first J of M particles along a path, and compute how likely they are for all M.
+        """Simulate measurements of the first J of M particles along a path, and compute their log-likelihood for all
+        particles.
 
         ``out`` (J, M): the log-likelihood of particle m for the measurements of particle j is added to ``out[j, m]``.
-        ``poses`` (S, M, 3): the poses of the particles at S stations of the path. ``metres``: the length of the path,
-        with turns as in :meth:`information`. ``stops`` (M,): the number of stations that each particle reaches.
-        ``seed``: paths with the same seed use the same random numbers.
+        ``poses`` (S, M, 3): the pose of each particle at S points of the path. ``metres``: the length of the path, with
+        turns as in :meth:`information`. ``stops`` (M,): the number of these points that each particle reaches.
+        ``seed``: calls with the same seed use the same random numbers.
         """

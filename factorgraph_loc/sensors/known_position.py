@@ -32,11 +32,11 @@ class KnownPosition:
 
     @property
     def odometry(self) -> ChainState:
-        """The odometry state at the time of the prior. It may change with further odometry before :meth:`settle`."""
+        """The odometry state at the time of the prior. Before :meth:`settle`, later odometry may change it."""
         return self.motion.state(self.t) if self._odometry is None else self._odometry
 
     def settle(self) -> None:
-        """Fix the odometry state at the start. Call this at the first measurement."""
+        """Store the odometry state at the start, so that it no longer changes. Call this at the first measurement."""
         self._odometry = self.odometry
 
     @property
@@ -44,26 +44,29 @@ class KnownPosition:
         return self.prior.t
 
     def facing(self, heading: float) -> PosePrior:
-        """Return the start as a Gaussian with mean ``heading`` [rad] and standard deviation pi of the heading."""
+        """Return the start as a Gaussian prior with mean ``heading`` [rad] and standard deviation pi of the heading."""
         covariance = self.prior.covariance.copy()
         covariance[2, 2] = math.pi**2
         return PosePrior(self.t, np.append(self.prior.pose[:2], heading), covariance)
 
     def mode(self, now: ChainState) -> Mode:
-        """Return a Gaussian of the pose at the odometry state ``now``, from start position and odometry alone."""
+        """Return a Gaussian of the pose at the odometry state ``now``, from start position and odometry alone. Its
+        ``weight`` is 1."""
         x, y, turned = self.motion.relative(self.odometry, now).delta
         covariance = self.prior.covariance.copy()
         covariance[:2, :2] += 0.5 * (x**2 + y**2) * np.eye(2)  # displacement in an unknown direction
         return Mode(1.0, np.append(self.prior.pose[:2], turned), covariance)
 
     def candidates(self, now: ChainState) -> Array:
-        """Return the poses (N, 3) to which the odometry leads until ``now``, from N evenly spaced start headings."""
+        """Return possible poses (N, 3) at the odometry state ``now``: N evenly spaced start headings, moved by the
+        odometry."""
         headings = np.arange(HEADINGS) * 2.0 * math.pi / HEADINGS
         starts = np.column_stack((np.tile(self.prior.pose[:2], (HEADINGS, 1)), headings))
         return se2.compose(starts, self.motion.relative(self.odometry, now).delta)
 
     def drawn(self, rng: np.random.Generator, count: int, now: ChainState) -> Array:
-        """Return ``count`` random poses (N, 3) at the odometry state ``now``, with stratified headings."""
+        """Return ``count`` random poses (N, 3) at the odometry state ``now``. They start at random positions of the
+        prior, with stratified headings over the full circle, and move with the odometry and its noise."""
         moved = self.motion.relative(self.odometry, now)
         positions = self.prior.pose[:2] + positive.draws(self.prior.covariance[:2, :2], count, rng)
         headings = (rng.permutation(count) + rng.random(count)) * 2.0 * math.pi / count - math.pi
@@ -73,14 +76,15 @@ class KnownPosition:
     def loss(self, poses: Array, now: ChainState, noise: Array | None = None) -> Array:
         """Return half the squared Mahalanobis distances (N,) of N start positions from the known start position.
 
-        The start positions follow from ``poses`` (N, 3) at the odometry state ``now`` and the odometry. ``noise`` (3,
-        3): an additional body-frame covariance of the poses.
+        The start positions follow from the odometry and from ``poses`` (N, 3) at the odometry state ``now``. ``noise``
+        (3, 3): an additional body-frame covariance of the poses.
         """
         error, _, covariance = self._linearized(poses, now, noise)
         return np.asarray(0.5 * np.einsum("ni,ni->n", error, positive.solve(covariance, error[..., None])[..., 0]))
 
     def log_density(self, poses: Array, now: ChainState) -> Array:
-        """Return the log prior density (N,) of ``poses`` (N, 3) at the odometry state ``now``."""
+        """Return the log density (N,) of ``poses`` (N, 3) at the odometry state ``now``. The density is the prior of
+        the start, propagated by the odometry."""
         _, _, covariance = self._linearized(poses, now, None)
         normaliser = 0.5 * np.linalg.slogdet(2.0 * math.pi * covariance)[1] + math.log(2.0 * math.pi)
         return np.asarray(-self.loss(poses, now) - normaliser)
@@ -93,10 +97,12 @@ class KnownPosition:
         return weighted @ jacobian, (weighted @ error[..., None])[..., 0]
 
     def whitened(self, pose: Array, now: ChainState) -> tuple[Array, Array, Array]:
-        """Return the whitened residual (2,) of the start position that follows from ``pose`` (3,) and the odometry.
+        """Return a whitened residual (2,), its Jacobian (2, 3), and the covariance (3, 3) of the odometry since the
+        start.
 
-        It is whitened with the prior covariance. Also returns its Jacobian (2, 3) by the body-frame perturbation of
-        the pose, and the covariance (3, 3) of the odometry since the start. ``now``: see :meth:`loss`.
+        The residual is the error of the start position that follows from the odometry and from ``pose`` (3,) at the
+        odometry state ``now``. It is whitened with the prior covariance. The Jacobian is by the body-frame perturbation
+        of the pose.
         """
         error, jacobian, _ = self._linearized(pose[None], now, None)
         root = positive.root(self.prior.covariance[:2, :2])

@@ -40,10 +40,10 @@ HORIZON = 5.0  # s; older odometry is discarded during a run
 def odometry_model(rig: Rig, *, use_gyro: bool = False, constants_as_noise: bool = False) -> OdometryModel:
     """Return the odometry model of a rig.
 
-    ``use_gyro``: True to take the noise of the heading from the gyro.
-    ``constants_as_noise``: True to add the uncertainty of the calibration constants to the noise. Use this if the
-    constants are not estimated. The variances are those after the distance :data:`WAY`, the rotation :data:`TURN` and
-    the time :data:`TIME`.
+    ``use_gyro``: True if the gyro replaces the rotation of the wheels. The noise of the heading is then that of the
+    gyro. ``constants_as_noise``: True to add the uncertainty of the calibration constants to the noise. Use this if the
+    constants are not estimated. The added variances are those after the distance :data:`WAY`, the rotation :data:`TURN`
+    and the time :data:`TIME`.
     """
     s = rig.of(OdometrySettings)
     along, heading = s.noise.along.model(), s.noise.heading.model()
@@ -93,8 +93,8 @@ class Motion(OdometryChain):
         self._diagnostics = diagnostics
 
     def add(self, m: Measurement) -> None:
-        """Add one row, or several as :class:`~factorgraph_loc.model.measurement.Rows`. The diagnostics count rows of
-        unused sensors as ignored and rows that are too old as late."""
+        """Add one measurement of odometry or gyro, or several as :class:`~factorgraph_loc.model.measurement.Rows`. The
+        diagnostics count rows of unused sensors as ignored and rows that are too old as late."""
         kept: int
         match m:
             case Rows(kind=kind) if kind is VelocityOdometry and self._use_wheels:
@@ -112,21 +112,21 @@ class Motion(OdometryChain):
             self._diagnostics.drop_late("odometry", m.count - kept)
 
     def changed(self, increment: Increment, constants: Array) -> tuple[Array, Array]:
-        """Return the logarithm (3,) of the motion of an increment, corrected with the estimated ``constants`` (P,).
-        Also return its Jacobian (3, P) by the constants."""
+        """Return the SE(2) logarithm (3,) of the motion of ``increment``, corrected with the estimated ``constants``
+        (P,), and its Jacobian (3, P) by the constants."""
         delta, jacobian = kernels.changed(se2.log(increment.delta), increment.moving, constants, self._indices)
         return delta, jacobian
 
     def recalibrated(self, increment: Increment, constants: Array) -> Increment:
-        """Return a copy of an increment, with its motion corrected with the estimated ``constants`` (P,)."""
+        """Return a copy of ``increment`` with its motion corrected by the estimated ``constants`` (P,)."""
         if not self.constants.names:
             return increment
         delta = kernels.recalibrated(increment.delta, increment.moving, constants, self._indices)
         return Increment(delta, increment.covariance, increment.duration, increment.still)
 
     def poses_at(self, start: ChainState, t: Array, constants: Array) -> Array:
-        """Return the robot's poses (R, 3) at times ``t`` (R,) [s], relative to the pose at ``start``. The motion is
-        corrected with the estimated ``constants`` (P,), to first order."""
+        """Return the robot's poses (R, 3) at times ``t`` (R,) [s], in the robot frame at the odometry state ``start``.
+        The motion is corrected with the estimated ``constants`` (P,), to first order."""
         states = self.states(t)
         deltas = se2.between(np.array((start.x, start.y, start.heading)), states[:, 1:4])
         if not self.constants.names:
@@ -138,13 +138,14 @@ class Motion(OdometryChain):
         return np.asarray(se2.exp(moved))
 
     def slip(self, increment: Increment) -> tuple[Array, float]:
-        """Return the covariance (3, 3) that wheel slip adds to that of an increment, and the negative logarithm of the
-        probability of slip."""
+        """Return the covariance (3, 3) to add to an increment with wheel slip, and the negative log-probability of
+        slip."""
         return slip(self.model, increment, use_gyro=self._use_gyro)
 
 
 def whole_motion(log: Log, sensors: Sequence[str]) -> Motion:
-    """Return the motion in a whole log. ``sensors``: names of the sensors to use, "odometry" or "imu" or both."""
+    """Return the integrated odometry of a whole log, without a limit of age. ``sensors``: names of the sensors to use,
+    "odometry" or "imu" or both."""
     motion = Motion(log.rig, tuple(sensors), Diagnostics())
     motion.horizon = math.inf
     for m in log.measurements(sensors):
@@ -154,21 +155,23 @@ def whole_motion(log: Log, sensors: Sequence[str]) -> Motion:
 
 
 def odometry_of(log: Log) -> VelocityStream | IncrementStream:
-    """Return the odometry stream of a log that has one."""
+    """Return the odometry stream of ``log``. The log must have one."""
     stream = log.streams["odometry"]
     assert isinstance(stream, VelocityStream | IncrementStream)
     return stream
 
 
 def overlap(log: Log) -> tuple[float, float]:
-    """Return the start and the end [s] of the time for which a log has odometry and a reference trajectory."""
+    """Return the start and the end [s] of the time in a log with both odometry and a reference trajectory. The start is
+    after the end if the log has no such time."""
     assert log.reference is not None
     t = odometry_of(log).t + log.rig.time_offset("odometry")
     return max(float(t[0]), float(log.reference.t[0])), min(float(t[-1]), float(log.reference.t[-1]))
 
 
 def integrated(log: Log, model: OdometryModel) -> OdometryChain:
-    """Integrate all odometry rows of a log with the odometry model ``model``. Returns the chain of states."""
+    """Return the integrated odometry of a log as a chain of states, which can be interpolated at any time. ``model``:
+    the odometry model with calibration constants and noise."""
     chain = OdometryChain(model, horizon=np.inf)
     stream = odometry_of(log)
     t = stream.t + log.rig.time_offset("odometry")

@@ -105,7 +105,8 @@ def sensors() -> Mapping[str, SensorType]:
 
 
 def sensor(name: str) -> SensorType:
-    """Return the sensor that has this name, or that has a channel with this name. Raises InputError for other names."""
+    """Return the type of the sensor ``name``, or of the sensor with the channel ``name``. Raises InputError for other
+    names."""
     if name in sensors():
         return sensors()[name]
     if name in channels():
@@ -114,7 +115,7 @@ def sensor(name: str) -> SensorType:
 
 
 def sections_of(sensor: SensorType) -> dict[str, list[Setting]]:
-    """Return the settings of each section of the rig that belongs to ``sensor``, by the name of the section."""
+    """Return the settings in each section of the rig that belongs to the sensor type ``sensor``, by section name."""
     return {name: settings_in(load(section.kind)) for name, section in sensor.settings.items()}
 
 
@@ -143,8 +144,8 @@ def sensor_of(channel: str) -> SensorType:
 
 
 def moving(names: Iterable[str], rank: int = 0) -> tuple[str, ...]:
-    """Return those of the channels ``names`` that measure the motion of the robot. Channels that measure only rotation
-    are included if ``rank`` is :data:`~factorgraph_loc.model.measurement.TURN`."""
+    """Return those of the channels ``names`` that measure the motion of the robot. ``rank``: use
+    :data:`~factorgraph_loc.model.measurement.TURN` to include channels that measure only rotation."""
     streams = {name: channels()[kind_of(name)].streams for name in names if kind_of(name) in channels()}
     return tuple(name for name, kinds in streams.items() if kinds and kinds[0].rank <= rank)
 

@@ -36,8 +36,8 @@ class Traced:
 
 
 def recordings(logs: Sequence[Log]) -> list[int]:
-    """Return a number for each log, which is equal for logs of the same recording: the index of the first such log.
-    Logs belong to the same recording if they differ only in their odometry."""
+    """Return for each log the index of the first log of the same recording. Logs belong to the same recording if they
+    differ only in their odometry."""
     keys = [_exteroceptive(log) or i for i, log in enumerate(logs)]
     return [keys.index(key) for key in keys]
 
@@ -51,7 +51,8 @@ def _exteroceptive(log: Log) -> bytes:
 
 @dataclass(frozen=True)
 class Corrections:
-    """Corrections ``each`` (N,) of a constant in N logs, their ``mean`` and their standard deviation ``scatter``."""
+    """Corrections ``each`` (N,) of a constant in N logs, their ``mean``, and their standard deviation ``scatter`` over
+    logs."""
 
     each: Array
     mean: float
@@ -59,15 +60,15 @@ class Corrections:
 
     @property
     def error(self) -> float:
-        """The standard error of the mean."""
+        """The standard error of ``mean``."""
         return self.scatter / float(np.sqrt(len(self.each)))
 
 
 def pooled(corrections: Sequence[tuple[float, float]], known: float) -> Corrections:
-    """Return the mean of corrections of a constant over N logs, and their scatter without estimation errors.
+    """Return the mean of corrections of a constant over N logs, and the scatter between logs without estimation errors.
 
     ``corrections``: N pairs of a correction and its standard deviation. ``known``: the standard deviation in the input
-    rig, with which the scatter is averaged. It has the weight of :data:`WORTH` logs.
+    rig. The scatter is averaged with it. It has the weight of :data:`WORTH` logs.
     """
     each, errors = np.array(corrections).T
     beyond = float(np.sum((each - each.mean()) ** 2) - (len(each) - 1) * np.mean(errors**2))
@@ -76,8 +77,8 @@ def pooled(corrections: Sequence[tuple[float, float]], known: float) -> Correcti
 
 
 def corrections_of(name: str, traced: Sequence[Traced]) -> list[tuple[float, float]]:
-    """Return the correction of the constant ``name`` and its standard deviation in each log. Returns [] if a log lacks
-    an estimate of the constant."""
+    """Return a pair for each log: the correction of the constant ``name`` and its standard deviation. Returns [] if a
+    log lacks an estimate of the constant."""
     corrections = [trace.constants[name] for trace in traced if trace.constants and name in trace.constants]
     return corrections if len(corrections) == len(traced) else []
 

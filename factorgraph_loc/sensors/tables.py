@@ -58,13 +58,14 @@ class Writing:
 
 @cache
 def tables_of(channel: Channel) -> tuple[Table, ...]:
-    """Return the descriptions of the files of a channel in a log. Descriptions with the same name are alternatives."""
+    """Return the descriptions of a channel's files in a log. Descriptions with the same name are alternative
+    formats."""
     return tuple(load(place) for place in channel.tables)
 
 
 @cache
 def native_tables() -> Mapping[str, tuple[Channel, tuple[Table, ...]]]:
-    """Return all tables of the native format by name: the channel and the alternative descriptions of each table."""
+    """Return all tables of the native format by name: the channel and the alternative formats of each table."""
     return {
         table.name: (channel, tuple(candidate for candidate in tables_of(channel) if candidate.name == table.name))
         for channel in channels().values()
@@ -73,8 +74,9 @@ def native_tables() -> Mapping[str, tuple[Channel, tuple[Table, ...]]]:
 
 
 def native_table(name: str) -> tuple[str, tuple[Table, ...]] | None:
-    """Return the channel of the table ``name`` of the native format, and the alternative descriptions of the table.
-    Returns None for other names. A table of one of several sensors has a name such as "bearing_range.front"."""
+    """Return the name of the channel and the alternative formats of the table ``name`` of the native format. Returns
+    None if there is no such table. If a rig has several sensors of a type, a table is named like
+    "bearing_range.front"."""
     kind, _, own = name.partition(".")
     if kind not in native_tables() or (kind != name and not (kind in several() and is_name(own))):
         return None
@@ -106,7 +108,8 @@ def assemble(channel: Channel, rows: Mapping[str, TableRows], reading: Reading) 
 
 
 def stream_of(table: Table, rows: TableRows, t0_ns: int, warnings: list[Notice]) -> Stream:
-    """Return the rows of a table as a stream of measurements. ``warnings``: a list to append warnings to.
+    """Return the rows of a table as a stream of measurements. ``t0_ns``: the absolute time of t = 0 [ns]. ``warnings``:
+    a list to append warnings to.
 
     If several rows have the same timestamp, only the last one is kept. If a measurement consists of several rows with
     names, the last row of each name is kept. Raises InputError with file, row and column for values out of bounds,
@@ -145,7 +148,8 @@ def _all_empty(columns: Sequence[Array]) -> NDArray[np.bool_]:
 
 
 def _without_small(column: Column, rows: TableRows, warnings: list[Notice]) -> Array:
-    """Return the numbers (N,) of a column. Numbers below ``column.left_out_below`` become NaN, with a warning."""
+    """Return the numbers (N,) of a column. Numbers below ``column.left_out_below`` become NaN. A warning about them is
+    appended to ``warnings``."""
     values = rows.numbers[column.name]
     small = np.flatnonzero(values < column.left_out_below)
     if not len(small):
@@ -181,10 +185,12 @@ M = TypeVar("M", bound=Measurement)
 
 
 class Intake:
-    """Checks and converts each measurement that a program passes to the live localizer. This class changes nothing."""
+    """Checks and converts each measurement that a program passes to the live localizer. This base class accepts all
+    measurements without changes."""
 
     def measured(self, m: Measurement) -> Measurement:
-        """Return ``m`` in the form that estimators need, such as the features of an image. Any thread may call this."""
+        """Return ``m`` in the form that estimators need, such as the features of an image. This method is
+        thread-safe."""
         return m
 
     def require(self, m: Measurement) -> None:
@@ -193,12 +199,12 @@ class Intake:
 
 @cache
 def kinds() -> Mapping[type[Any], Channel]:
-    """Return all classes of measurements, each with its channel."""
+    """Return the channel of each class of measurements."""
     return {stream.kind: channel for channel in channels().values() for stream in channel.streams}
 
 
 def channel_of(kind: type[Any]) -> Channel:
-    """Return the channel of the measurement class ``kind``. Raises InputError if ``kind`` is another class."""
+    """Return the channel of the measurement class ``kind``. Raises InputError if ``kind`` is no measurement class."""
     if kind not in kinds():
         known = ", ".join(each.__name__ for each in kinds())
         raise InputError(f"{kind.__name__} is not a measurement, expected one of {known}")

@@ -39,10 +39,11 @@ if TYPE_CHECKING:
 
 
 class LoopSettings(SensorSettings):
-    """Noise of loop closures that another program found. A rig without this section has the defaults.
+    """Noise of loop closures that another program has detected. If the rig lacks this section, the defaults apply.
 
-    The standard deviations and the scale ``robust`` are those of a loop of score 1. For a loop of score s, the standard
-    deviations are divided by s. The residual [m, rad] above which the loop is rejected is multiplied by sqrt(s).
+    A loop closure has a score, its confidence from 0 to 1. The standard deviations and ``robust`` apply to the score 1.
+    For a score s, the standard deviations are divided by s. The residual [m, rad] above which a loop closure is
+    rejected is multiplied by sqrt(s).
     """
 
     sigma_position: Annotated[float, Field(ge=1e-4, le=10.0), InUnit("m")] = 0.1

@@ -18,8 +18,9 @@ LEAST_SCORE = 0.01  # smaller scores are raised to this
 
 
 class LoopSensor(Sensor):
-    """The loop closures of another program in a run. Each becomes a robust factor on two poses. A loop is ignored if
-    the estimator does not keep the earlier pose. Filters keep no earlier poses."""
+    """A sensor that uses loop closures of another program. Each loop closure becomes a robust factor on two poses.
+    Limitation: a loop closure is ignored if the estimator's state does not contain the earlier pose, as in all
+    filters."""
 
     modality = "loops"
     links = True
@@ -29,7 +30,8 @@ class LoopSensor(Sensor):
         self._settings, self._diagnostics = settings, binding.diagnostics
 
     def observe(self, m: Loops, view: View) -> Iterator[Link]:
-        """Yield a factor on two poses for each loop closure in ``m`` that is not ignored."""
+        """Yield a factor on two poses for each loop closure in ``m``. A loop closure is ignored if its score is too low
+        or if ``view`` has no earlier pose."""
         settings = self._settings
         scores = np.where(np.isnan(m.score), 1.0, m.score)
         for age, x, y, heading, score in zip(m.age, m.x, m.y, m.heading, scores.tolist(), strict=True):

@@ -59,9 +59,9 @@ FLOOR = np.array(((0.01, 0.0, 0.0), (0.005, 0.0, 0.0), (0.003, 0.005, 0.0)))
 
 @dataclass(frozen=True)
 class Windows:
-    """M time windows of a log. ``begin``, ``end`` (M,): their first and last time [s]. ``motion`` (M, 3): the motion of
-    the reference in each window, in the robot frame at its first time. ``sigmas`` (M, 3): standard deviations of the
-    errors of the odometry [m, m, rad]."""
+    """M time windows of a log, for comparison of odometry and reference. ``begin``, ``end`` (M,): their first and last
+    time [s]. ``motion`` (M, 3): the motion of the reference in each window, in the robot frame at its first time.
+    ``sigmas`` (M, 3): standard deviations of the errors of the odometry [m, m, rad]."""
 
     log: Log
     begin: Array
@@ -74,7 +74,8 @@ class Windows:
         return self.begin
 
     def states(self, model: OdometryModel) -> tuple[Array, Array]:
-        """Return the odometry states at the first time (M, 8) and at the last time (M, 8) of each window."""
+        """Return the odometry states (M, 8) at the begin and (M, 8) at the end of each window. The columns are those of
+        :class:`factors.motion.ChainState`."""
         chain = integrated(self.log, model)
         return chain.states(self.begin), chain.states(self.end)
 
@@ -90,7 +91,7 @@ class Windows:
         return self.errors(self.model(settings)) / self.sigmas
 
     def model(self, settings: OdometrySettings) -> OdometryModel:
-        """Return the odometry model with these settings."""
+        """Return the odometry model of the log's rig with other ``settings`` of the odometry."""
         return odometry_model(self.log.rig.model_copy(update={"odometry": settings}))
 
     def covariances(self, model: OdometryModel) -> Array:
@@ -119,8 +120,8 @@ class NoiseFit:
     """The estimated noise of the odometry.
 
     ``growth``: the noise of each error, by name ("along", "lateral", "heading"). ``outliers``: the fraction of windows
-    that are outliers. ``widened``: the factor by which ``growth`` was enlarged to explain the errors in long windows.
-    ``floored``: names of the errors for which the noise was raised to its lower bound.
+    that are outliers. ``widened``: the factor by which ``growth`` was enlarged to explain errors in long windows.
+    ``floored``: names of the errors with noise that was raised to its lower bound.
     """
 
     growth: Mapping[str, Growth]
@@ -137,9 +138,10 @@ def with_noise(model: OdometryModel, sigmas: Array) -> OdometryModel:
 
 
 def fit_noise(logs: Sequence[Log], model: OdometryModel) -> NoiseFit:
-    """Fit the noise of the odometry to its errors in windows of several lengths, without outliers.
+    """Return the noise of the odometry, fitted to its errors in windows of several lengths, without outliers.
 
-    The fitted noise is enlarged if errors in windows of :data:`BLACKOUT` seconds are larger than it predicts.
+    ``model``: the constants of the odometry. Its noise is not used. The fitted noise is enlarged if errors in windows
+    of :data:`BLACKOUT` seconds are larger than it predicts.
     """
     windows = [cut(log, length) for log in logs for length in LENGTHS]
     bases = np.concatenate([_unit_covariances(part, model) for part in windows])
@@ -226,7 +228,8 @@ class OdometryCalibrator(ConstantsCalibrator):
     def learn(
         self, traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path | None, like: SensorKnowledge | None = None
     ) -> SensorKnowledge:
-        """See :meth:`Calibrator.learn`. The result is empty if the reference has no headings."""
+        """Return the constants and noise, see :meth:`Calibrator.learn`. The result is empty if the reference has no
+        headings."""
         reference = traced[0].log.reference
         has_heading = reference is not None and reference.has_heading
         return super().learn(traced, rig, first, grids, like) if has_heading else SensorKnowledge()
@@ -242,8 +245,8 @@ class OdometryCalibrator(ConstantsCalibrator):
         return windows
 
     def parameters(self, parts: Sequence[Windows], settings: OdometrySettings) -> list[Parameter]:
-        """Return the constants to estimate, with priors. They depend on the data: commanded velocities also have delay,
-        lag and slowdown, and larger biases than wheel encoders."""
+        """Return the constants to estimate, with priors around their values in ``settings``. For logs with commanded
+        velocities, they include delay, lag and slowdown, and the priors of the biases are wider."""
         commanded = isinstance(odometry_of(parts[0].log), VelocityStream)
         by_speed, by_turn = (0.005, 0.002) if commanded else (0.0005, 0.0005)  # m/s, rad/s; prior sigmas
         priors = {
@@ -278,7 +281,8 @@ class OdometryCalibrator(ConstantsCalibrator):
         return weighted, settings
 
     def finished(self, parts: Sequence[Windows], rig: Rig, knowledge: SensorKnowledge) -> SensorKnowledge:
-        """Return the result ``knowledge`` with the noise of the calibrated odometry, warnings and residuals."""
+        """Return ``knowledge``, the fitted constants, with the noise of the calibrated odometry, warnings and
+        residuals. ``rig``: the rig with these constants."""
         noise = fit_noise([part.log for part in parts], odometry_model(rig))
         growth = {error: GrowthSettings.bounded(**asdict(g)) for error, g in noise.growth.items()}
         settings = rig.odometry.model_copy(update={"noise": OdometryNoise(**growth)})

@@ -95,10 +95,10 @@ def jump_warning(kind: str, events: list[Jump], stream: Motion, end: str) -> Not
 
 
 def without_jumps(stream: M, rules: RowRules, warnings: list[Notice]) -> M:
-    """Remove the rows with jumps from odometry or from the turn rates of a gyro.
+    """Return the stream without the rows that have jumps, and append a warning about them to ``warnings``.
 
-    Returns the remaining rows, and appends a warning to ``warnings``. If the log's rules for bad rows, ``rules``, are
-    to refuse them, the stream is returned unchanged. The motion of a removed increment is marked as unknown.
+    ``rules``: the log's rules for bad rows. If they refuse bad rows instead of skipping them, the stream is returned
+    unchanged. The motion of a removed increment is marked as unknown.
     """
     if rules.bad_rows == "refuse" or not (events := jumps(stream)):
         return stream

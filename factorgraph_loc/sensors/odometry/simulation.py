@@ -27,7 +27,7 @@ DESCRIPTION = (
 
 
 def simulate(ride: Ride) -> Simulated:
-    """Return the simulated wheel odometry of a drive."""
+    """Return the stream "odometry" of a simulated drive: increments of its true trajectory with errors."""
     return Simulated({"odometry": wheel_odometry(ride.truth, int(ride.rng("odometry").integers(2**32)))})
 
 

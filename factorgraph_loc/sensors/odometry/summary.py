@@ -34,8 +34,8 @@ COVERED = 0.9  # a reference should cover at least this fraction of a log's time
 
 @dataclass(frozen=True)
 class RateMatch:
-    """The relation of two signals of the same motion. ``shift``: the delay [s] of the second signal. ``slope``: the
-    factor by which the second signal is larger than the first, negative if the signs differ."""
+    """The relation of two signals of the same motion. ``shift``: the delay [s] of the second signal relative to the
+    first. ``slope``: the second signal divided by the first, negative if the signs differ."""
 
     shift: float
     slope: float
@@ -63,11 +63,11 @@ def _jumps(log: Log) -> list[Notice]:
 
 
 def against_reference(log: Log) -> tuple[dict[str, float], list[Notice]]:
-    """Compare the reference with the odometry. Returns a dict of ratios and a list of warnings.
+    """Return ratios that compare the reference with the odometry, and a list of warnings.
 
-    ``travels``, ``turns``: the distance and the rotation of the reference, divided by those of the odometry. The dict
-    lacks ratios for which the robot moves too little. The only warning is that the reference stands still while the
-    odometry drives.
+    The ratios by name: ``travels``, ``turns``: the distance and the rotation of the reference, divided by those of the
+    odometry. A ratio is missing if the robot moves too little. The only possible warning is that the reference stands
+    still while the odometry drives.
     """
     stream, reference = log.streams.get("odometry"), log.reference
     if reference is None or not isinstance(stream, VelocityStream | IncrementStream) or len(stream.t) < 2:
@@ -162,7 +162,7 @@ def _longest(t: Array) -> tuple[float, float]:
 
 
 def match(rates: Array, delayed: Array) -> RateMatch | None:
-    """Estimate the delay of ``delayed`` (N,) relative to ``rates`` (N,), and the ratio of the two signals.
+    """Return the delay [s] of ``delayed`` (N,) relative to ``rates`` (N,), and the ratio ``delayed`` / ``rates``.
 
     Both are sampled every ``STEP`` seconds. Returns None if they are uncorrelated. The delay is 0 if it hardly improves
     the correlation, or if the rates are nearly constant.
@@ -194,8 +194,8 @@ def _correlation(rates: Array, signal: Array, shift: int) -> tuple[float, float]
 
 
 def _compared(sensor: str, name: str, compared: RateMatch | None) -> list[Notice]:
-    """Return warnings about a wrong clock, sign or unit of the signal ``name``. ``compared``: the relation between
-    odometry and signal. ``sensor``: the section of the rig with the ``time_offset`` to set."""
+    """Return warnings about a wrong clock, sign or unit of the signal ``name``. ``compared``: its relation to the
+    odometry, or None for no warnings. ``sensor``: the section of the rig with the ``time_offset`` to set."""
     if compared is None:
         return []
     lines = []

@@ -61,7 +61,8 @@ class PositionFinder:
 
     @property
     def suspicious_since(self) -> float | None:
-        """The time [s] since which all positions contradict the estimated pose, or None if this time is too short."""
+        """The time [s] since which all positions contradict the estimated pose. None if this time is too short or
+        zero."""
         if not self._beyond or not all(beyond for _, beyond in self._beyond):
             return None
         first, last = self._beyond[0][0], self._beyond[-1][0]
@@ -97,7 +98,8 @@ class PositionFinder:
         return since if positive.squared(error, world) > BEYOND * GATE else None
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
-        """Return ``count`` random poses (N, 3) at the time of the last position. An unknown heading is uniform."""
+        """Return ``count`` random poses (N, 3) at the last position, or (0, 3) before the first. An unknown heading is
+        uniform."""
         if not self.hypotheses:
             return np.empty((0, 3))
         (mode,) = self.hypotheses
@@ -110,8 +112,8 @@ class PositionFinder:
         self._beyond.clear()
 
     def _add(self, odometry: ChainState, factor: PositionFactor) -> None:
-        """Store a position, see :class:`Row`. Late positions are skipped. A position replaces the previous one if less
-        than INTERVAL has passed."""
+        """Store a position: its ``odometry`` state and its ``factor``. Late positions are skipped. A position replaces
+        the previous one if less than INTERVAL has passed."""
         self._robust = factor.robust
         if self._rows and odometry.t <= self._rows[-1].odometry.t:
             return

@@ -32,8 +32,8 @@ class PositionObservation(ResidualObservation):
 
 
 class PositionSensor(Sensor):
-    """A position sensor in a run. A position that equals the previous one in all digits is ignored, because the system
-    only repeats its last result."""
+    """A sensor that uses measured positions of the robot. A position that exactly equals the previous one is ignored,
+    because the positioning system only repeats its last result."""
 
     modality = "position"
 
@@ -45,8 +45,8 @@ class PositionSensor(Sensor):
         self.finder = self._finder = PositionFinder(self.observation, binding.motion)
 
     def observation(self, m: Position, offset: Increment | None = None) -> PositionObservation:
-        """Return the observation of the measurement ``m``. ``offset``: the motion from the pose that the observation
-        must depend on to the time of ``m``, or None if the times are equal."""
+        """Return the observation of the measurement ``m`` as a constraint on one pose. ``offset``: the motion from this
+        pose to the time of ``m``, or None if the times are equal."""
         position, covariance = np.array((m.x, m.y)), self._settings.covariance(m)
         factor = PositionFactor(position, covariance, self._arm, self._settings.robust, offset)
         return PositionObservation(m.t, (Term(factor, (), 2),))

@@ -17,7 +17,7 @@ class PositionSimulation(FileModel):
 
 
 def simulate(ride: Ride) -> Simulated:
-    """Return the measured positions of a simulated drive: true positions of the rig's point, with Gaussian noise."""
+    """Return measured positions of a simulated drive: true positions of a point on the robot, with Gaussian noise."""
     settings = ride.rig.find(PositionSettings)
     if settings is None:
         return Simulated()
