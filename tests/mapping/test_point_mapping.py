@@ -71,7 +71,7 @@ def test_views_differ_and_are_few(look):
 
 def test_points_seen_too_seldom_or_known_too_badly_are_dropped(look):
     sight = look(np.random.default_rng(3))
-    with pytest.raises(RunFailedError, match="seen in 13 keyframes"):
+    with pytest.raises(RunFailedError, match="observed in 13 keyframes"):
         map_points(sight.model, posed(sight), ALL.model_copy(update={"observations": 13}))
     with pytest.raises(RunFailedError, match="standard deviation of at most 1e-06 m"):
         map_points(sight.model, posed(sight), ALL.model_copy(update={"sigma": 1e-6}))

@@ -140,7 +140,7 @@ def test_modes_that_are_next_to_each_other_are_one_place() -> None:
     at = {"here": (5.0, 5.0, 0.0), "beside": (6.5, 5.0, 0.3), "turned": (5.0, 5.0, 3.0), "rare": (20.0, 5.0, 0.0)}
     weights = (0.5, 0.3, 0.17, 0.03)
     modes = tuple(Mode(w, np.array(pose), covariance) for w, pose in zip(weights, at.values(), strict=True))
-    places = closed_loop._places(Belief(modes))
+    places = closed_loop._main_modes(Belief(modes))
     assert [place.weight for place in places] == [0.8, 0.17]
     assert [tuple(place.pose) for place in places] == [at["here"], at["turned"]]
 
