@@ -36,9 +36,9 @@ class Estimator(Protocol):
     def initialize(self, prior: PosePrior) -> None:
         """Start from a Gaussian prior of the pose. Before this call every estimate is ``unlocalized``.
 
-        Odometry from before the time of the prior may arrive before or after this call, but not after the first
-        measurement of another sensor. A prior without a heading is allowed if :func:`finds_heading` is true for the
-        estimator. Then no estimate has the status ``localized`` before the measurements determine the heading.
+        Odometry from before the prior's time may arrive before or after this call, but not after another sensor's first
+        measurement. A prior without a heading is allowed if :func:`finds_heading` is true for the estimator. Then no
+        estimate has the status ``localized`` before the measurements determine the heading.
         """
 
     def process(self, measurement: Measurement) -> None:

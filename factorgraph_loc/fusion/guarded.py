@@ -31,10 +31,10 @@ LEAST = 1e-9  # smaller eigenvalues of a correlation matrix are raised to this v
 
 
 class Guard:
-    """Calls an estimator and converts its failures to a RunFailedError.
+    """Calls an estimator and converts its exceptions to a RunFailedError.
 
     Use it as ``guard.process(estimator, measurement)`` or ``with guard.computing(what): ...``. ``who``: the name of the
-    estimator, and of the log if there is one, for messages. Warnings of NumPy are silenced inside, because
+    estimator, and of the log if there is one, for messages. NumPy's warnings are silenced during these calls, because
     :func:`sound` and :func:`sound_trajectory` check the results.
     """
 
@@ -48,8 +48,8 @@ class Guard:
 
     @contextmanager
     def quiet(self) -> Iterator[None]:
-        """Return a context that silences NumPy's warnings for a whole run. To silence them separately for each
-        measurement takes as long as processing one measurement of odometry."""
+        """Return a context that silences NumPy's warnings for a whole run. To silence them for each measurement would
+        double the time of an odometry measurement."""
         with np.errstate(all="ignore"):
             self._is_quiet = True
             try:
@@ -64,8 +64,8 @@ class Guard:
             estimator.process(measurement)
 
     def computing(self, what: str, t: float | None = None) -> Self:
-        """Return a context for a request to the estimator. ``what``: the requested result, such as "the estimate", for
-        messages. ``t`` [s]: its time, or None."""
+        """Return a context for a request to the estimator: an exception inside becomes a RunFailedError. ``what``: the
+        requested result, such as "the estimate", for the message. ``t`` [s]: the requested time, or None."""
         self._computing, self._of = what, t
         return self
 
@@ -90,7 +90,7 @@ class Guard:
 
 
 def sound(estimate: PoseEstimate) -> PoseEstimate:
-    """Check an estimate. Returns it with a covariance that is symmetric and positive definite.
+    """Return an estimate with a covariance that is symmetric and positive definite.
 
     A covariance that is indefinite because of rounding is replaced by the nearest positive definite one. Raises
     ValueError if the pose is not finite, or if the covariance cannot be repaired. An ``unlocalized`` estimate is
@@ -109,7 +109,8 @@ def sound(estimate: PoseEstimate) -> PoseEstimate:
 
 
 def sound_belief(belief: Belief) -> Belief:
-    """Check each mode of a belief as :func:`sound` checks an estimate, and check that the particles are finite."""
+    """Return a belief in which the covariance of each mode is symmetric and positive definite. Raises ValueError if a
+    mode cannot be repaired, or if a particle is not finite."""
     for values in (belief.particles, belief.weights):
         if values is not None and not np.all(np.isfinite(values)):
             raise ValueError("the particles are not finite")
@@ -120,7 +121,8 @@ def sound_belief(belief: Belief) -> Belief:
 
 
 def sound_trajectory(trajectory: Trajectory) -> Trajectory:
-    """Check a trajectory as :func:`sound` checks an estimate. The error names the time of the first invalid pose."""
+    """Return a trajectory with covariances that are symmetric and positive definite. Raises ValueError, with the time
+    of the first invalid pose, if a pose is not finite or a covariance cannot be repaired."""
     finite = np.isfinite(trajectory.poses).all(axis=1)
     if not finite.all():
         raise ValueError(f"the pose at {trajectory.t[~finite][0]:.3f} s is not finite")
@@ -136,8 +138,8 @@ def sound_trajectory(trajectory: Trajectory) -> Trajectory:
 
 
 def _positive(covariance: Array, where: str = "") -> Array:
-    """Return the result of :func:`nearest_positive`, or raise ValueError if it is None. ``where``: a text such as the
-    time of the pose, which is inserted in the message."""
+    """Return the nearest symmetric and positive definite matrix to a ``covariance`` (D, D). Raises ValueError if it
+    cannot be repaired. ``where``: a text for the message, such as the time of the pose."""
     repaired = nearest_positive(covariance)
     if repaired is None:
         why = "is not positive definite" if np.all(np.isfinite(covariance)) else "is not finite"
@@ -170,6 +172,7 @@ def _named(measurement: Measurement) -> str:
 
 
 def _reason(error: BaseException) -> str:
-    """Return the first line of an error's message that is not empty, or else the name of the error's type."""
+    """Return the first line of an exception's message that is not empty. If there is none, return the name of its
+    type."""
     lines = (" ".join(line.split()) for line in str(error).splitlines())
     return plain(next((line for line in lines if line), type(error).__name__))

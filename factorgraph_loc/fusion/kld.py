@@ -14,18 +14,19 @@ KERNEL = 0.25  # standard deviation of a kernel as a fraction of the distance be
 
 
 def enough(cells: Array | NDArray[np.int64]) -> Array:
-    """Return the number of particles that represent a distribution well enough if they occupy this number of ``cells``
-    of a grid (Fox, 2003, eq. 7, with the approximation of Wilson and Hilferty)."""
+    """Return the number of particles that KLD sampling needs if ``cells`` is the number of occupied grid cells. Source:
+    Fox, 2003, eq. 7, with the approximation of Wilson and Hilferty."""
     freedom = np.maximum(np.asarray(cells, dtype=float) - 1.0, 1.0)
     a = 2.0 / (9.0 * freedom)
     return np.asarray(freedom / (2.0 * ERROR) * (1.0 - a + np.sqrt(a) * QUANTILE) ** 3)
 
 
 def prefix(poses: Array, rng: np.random.Generator, least: int) -> NDArray[np.int64]:
-    """Return the indices of a random subset of ``poses`` (N, 3), with at least ``least`` poses, chosen by KLD sampling.
+    """Return the indices of a random subset of ``poses`` (N, 3), chosen by KLD sampling. It has at least ``least``
+    poses, if N allows.
 
-    Poses are added in random order until their number is :func:`enough` for the grid cells that they occupy, or until
-    all are added.
+    Poses are added in random order until their number is :func:`enough` for the grid cells that they occupy, or all are
+    added.
     """
     order = rng.permutation(len(poses))
     _, first = np.unique(cell_numbers(poses[order], CELL), return_index=True)
@@ -36,11 +37,12 @@ def prefix(poses: Array, rng: np.random.Generator, least: int) -> NDArray[np.int
 
 
 def jittered(poses: Array, rows: NDArray[np.int64], rng: np.random.Generator, room: Array | float = 0.0) -> Array:
-    """Return a random pose (K, 3) near each of the ``poses`` (N, 3) with the indices ``rows`` (K,), from Gaussian
-    kernels.
+    """Return poses (K, 3), each drawn from a Gaussian kernel around one of the ``poses`` (N, 3). ``rows`` (K,): the
+    indices of the kernels' centres.
 
-    The kernel's width is proportional to the cube root of the volume per particle: the number of occupied grid cells,
-    divided by the number of distinct particles. ``room`` (K,): a lower limit of this volume for each particle.
+    The kernel's width is proportional to the cube root of the volume per particle. This volume is the number of
+    occupied grid cells, divided by the number of distinct centres. ``room`` (K,): a lower limit of it for each new
+    pose.
     """
     chosen = poses[rows]
     cells = len(np.unique(cell_numbers(chosen, CELL)))

@@ -23,19 +23,20 @@ POSE = 3  # number of components of the pose, which are the first components of 
 
 @dataclass(frozen=True)
 class Layout:
-    """The layout of an error state: the pose, then blocks of sensor constants and landmarks. ``sizes``: the number of
-    components of each block, by name, in the order of the blocks."""
+    """The order of the variables in an error state: the pose (3 components), then one block per sensor or landmark.
+    ``sizes``: the number of components of each block, by name, in the order of the blocks."""
 
     sizes: Mapping[str, int] = field(default_factory=dict)
 
     @staticmethod
     def of(constants: Mapping[str, Estimated]) -> Layout:
-        """Make the layout for the estimated ``constants`` of sensors, one block per sensor. Empty blocks are left out."""
+        """Return the layout for the estimated ``constants`` of sensors, one block per sensor. Sensors without estimated
+        constants get no block."""
         return Layout({name: len(block.names) for name, block in constants.items() if block.names})
 
     @cached_property
     def columns(self) -> Mapping[str, slice]:
-        """The indices of each block in the error state, as slices."""
+        """The indices of each block in the error state, as a slice per name."""
         columns, start = {}, POSE
         for name, size in self.sizes.items():
             columns[name] = slice(start, start + size)
@@ -47,18 +48,18 @@ class Layout:
         return Layout({**self.sizes, name: size})
 
     def values(self, rest: Array) -> dict[str, Array]:
-        """Return the values of the blocks by name. ``rest`` (R,): the state without the pose."""
+        """Return the part of each block in ``rest`` by name. ``rest`` (R,): the state without the pose."""
         return {name: rest[part.start - POSE : part.stop - POSE] for name, part in self.columns.items()}
 
 
 def constants_of(motion: Motion, sensors: Mapping[str, Sensor]) -> dict[str, Estimated]:
-    """Return the estimated constants of the odometry (``motion``) and of the sensors, by the name of their block."""
+    """Return the estimated constants of the odometry (``motion``) and of each sensor, by name."""
     return {MOTION: motion.constants} | {name: sensor.constants for name, sensor in sensors.items()}
 
 
 def on_pose(observation: Observation, view: View) -> Observation:
     """Convert an observation to one that depends on the pose only. Sensor constants and landmarks are fixed at their
-    estimates in ``view``, and their covariances are added to the noise."""
+    estimates, and their covariances are added to the noise. ``view``: gives access to the estimates."""
     values = {name: np.asarray(view.value(name)) for name in observation.blocks}
     return observation.on_pose(values, {name: view.block_covariance(name) for name in observation.blocks})
 
@@ -68,10 +69,9 @@ def learnt_from(
 ) -> Learnt:
     """Return a report of estimated constants and landmarks.
 
-    ``constants``: the estimated constants of each sensor. ``blocks``: name, mean and covariance of each block of the
-    state. A block has the constants of a sensor, the constant of a landmark (1 component), or the position of a
-    landmark (2 components), which is called ``KIND/NAME``. Larger blocks are points in space and are left out.
-    ``points``: a map of estimated points, or None.
+    ``constants``: the estimated constants of each sensor. ``blocks``: for each sensor or landmark, its name, mean and
+    covariance. A landmark has a position (2 components) or a constant (1 component), and is called ``KIND/NAME``.
+    Larger blocks are points in space and are left out. ``points``: a map of estimated points, or None.
     """
     values: dict[str, tuple[float, float]] = {}
     landmarks: dict[str, LearntPoint] = {}

@@ -143,7 +143,7 @@ class ParticleFilter(Filter):
         return Belief(modes, cloud.poses, cloud.weights)
 
     def learnt(self) -> Learnt:
-        """Return the estimated constants."""
+        """Return the estimated sensor constants with standard deviations. The result has no landmarks."""
         if self._state is None:
             return Learnt()
         cloud = self._state
@@ -151,7 +151,7 @@ class ParticleFilter(Filter):
         return learnt_from(self._constants, ((name, *parts) for name, parts in moments.items()))
 
     def trajectory(self) -> Trajectory:
-        """Means and covariances of trajectories drawn by backward simulation. The causal estimates if ``smooth`` is false."""
+        """Return means and covariances of trajectories from backward simulation, or causal ones without ``smooth``."""
         last = {r.t: r for r in self._records}
         records = [last[t] for t in sorted(set(self._ticks))]
         if not self._smooth or not records:
@@ -173,7 +173,7 @@ class ParticleFilter(Filter):
         return Trajectory(np.array([r.t for r in records]), poses, np.array([c for _, c in moments]).reshape(-1, 3, 3))
 
     def forget(self, until: float) -> None:
-        """Delete the trajectory before ``until`` [s], but keep the last particles before it that are stored for smoothing."""
+        """Delete the trajectory before ``until`` [s], except for the last particles before it that smoothing needs."""
         clouds = [r.t for r in self._records if r.cloud is not None and r.t <= until]
         super().forget(max(clouds, default=-math.inf) if self._smooth else until)
 
@@ -206,7 +206,7 @@ class ParticleFilter(Filter):
         return self._sampled_cloud(self._t) if self._search.look(m, self._odometry) else None
 
     def _sampled_cloud(self, since: float) -> Cloud | None:
-        """Draw particles from the result of the search. Returns None if there is no result yet.
+        """Draw particles from the result of the global search. Returns None if there is no result yet.
 
         If the search has found one clear pose, the filter is then localized, and sensors restart at the time ``since``
         [s]. If the filter was localized before ``since``, the sensor constants from that time are used again.
@@ -256,7 +256,7 @@ class ParticleFilter(Filter):
         return replace(cloud, poses=poses, odometry=self._odometry)
 
     def _moments(self) -> tuple[Array, Array]:
-        """Mean (3,) and covariance (3, 3) of the present pose in the world frame."""
+        """Return mean (3,) and covariance (3, 3) of the present pose in the world frame."""
         cloud = self._state
         if cloud.odometry.t == self._t:
             return cloud.moments
@@ -336,8 +336,8 @@ class ParticleFilter(Filter):
     def _weigh(self, observation: Observation) -> float:
         """Weigh the particles by an observation, and return the logarithm of the mean likelihood.
 
-        If weighing is costly, a few particles are corrected first (:func:`~factorgraph_loc.fusion.cloud.corrected`).
-        All particles are then drawn from these few, and corrected by the last step.
+        If the observation is costly, a few particles are corrected first
+        (:func:`~factorgraph_loc.fusion.cloud.corrected`). Then all are drawn from these and corrected by the last step.
         """
         cloud, count, enough = self._state, self._settings.particles, self._settings.resample_below
 
@@ -390,7 +390,7 @@ class ParticleFilter(Filter):
         return Record(self._t, self._odometry, estimate.pose, estimate.covariance, self._state if keep else None)
 
     def _is_due(self) -> bool:
-        """True if the particles must be stored now for smoothing, because the interval is over or because they have jumped."""
+        """Return True if smoothing needs the present particles: the interval is over, or they have jumped."""
         if self.diagnostics.events and self.diagnostics.events[-1].t == self._t:
             return True
         last = next((r.t for r in reversed(self._records) if r.cloud is not None), -math.inf)

@@ -33,9 +33,9 @@ BREAK = 100.0  # squared Mahalanobis distance of a particle from a possible ance
 
 @dataclass(frozen=True)
 class Record:
-    """The state of the filter at time ``t`` [s].
+    """The state of a particle filter at time ``t`` [s].
 
-    ``odometry``: the integrated odometry. ``mean`` (3,), ``covariance`` (3, 3): the causal estimate, in the world
+    ``odometry``: the integrated odometry. ``mean`` (3,), ``covariance`` (3, 3): the estimate at that time, in the world
     frame. ``cloud``: the particles if they are stored for smoothing, otherwise None.
     """
 
@@ -46,18 +46,17 @@ class Record:
     cloud: Cloud | None
 
     def lost(self) -> Record:
-        """Return the record with ``localized`` false in its cloud, because its particles are at a wrong pose."""
+        """Return the record with ``cloud.localized`` set to False, for particles at a wrong pose."""
         return self if self.cloud is None else replace(self, cloud=replace(self.cloud, localized=False))
 
 
 class BackwardSimulation:
-    """Trajectories drawn backwards through the clouds of a particle filter.
+    """Trajectories drawn backwards through the stored particles of a particle filter, for smoothing.
 
-    ``kept``: records with clouds, in order of time. ``count``: the number of trajectories.
-    ``increment(start, end)``: returns the odometry between two records.
-    ``moved(cloud, increment)``: returns the poses (N, 3) of a cloud after an increment, without noise, and their
-    transition (3, 3+P) from body-frame perturbation and constants.
-    ``changes``: the intervals [s] when the robot was carried to another place.
+    ``kept``: records with particles, in order of time. ``count``: the number of trajectories. ``increment(start,
+    end)``: returns the odometry between two records. ``moved(cloud, increment)``: moves particles without noise. It
+    returns their poses (N, 3), and the transition matrix (3, 3+P) from body-frame perturbation and constants.
+    ``changes``: the intervals (start, end) [s] when the robot was carried to another place.
     """
 
     def __init__(
@@ -83,8 +82,8 @@ class BackwardSimulation:
             self._missed.insert(0, missed)
 
     def at(self, record: Record) -> tuple[Array, Array]:
-        """Return the mean (3,) and covariance (3, 3), in the world frame, of the trajectories at any record. Between
-        two clouds they are interpolated along the odometry."""
+        """Return the mean (3,) and covariance (3, 3) of the trajectories at the time of any record, in the world frame.
+        Between stored particles the trajectories are interpolated along the odometry."""
         k = int(np.searchsorted(self._t, record.t, side="right")) - 1
         if any(self._t[k] < end <= record.t for _, end in self._changes):
             # the robot was carried since the earlier cloud: move the later cloud back by odometry

@@ -63,7 +63,7 @@ BEGUN = 80  # cost of drawing one initial particle, including the preparation of
 
 
 class Evidence(Protocol):
-    """The part of an :class:`~factorgraph_loc.sensors.base.Observation` that particles need."""
+    """The attributes and the method of an :class:`~factorgraph_loc.sensors.base.Observation` that particles need."""
 
     @property
     def found(self) -> int: ...
@@ -75,8 +75,8 @@ class Evidence(Protocol):
 
 
 class WeighedObservation(NamedTuple):
-    """An observation with the integrated ``odometry`` at its time. ``evidence``: the log-probability of the observation
-    if the estimator's pose (the track) is right, zero if the estimator has no pose."""
+    """An observation for particles. ``odometry``: the integrated odometry at its time. ``evidence``: the
+    log-probability of the observation if the estimator's present pose is right, zero if the estimator has no pose."""
 
     odometry: ChainState
     observation: Evidence
@@ -84,15 +84,15 @@ class WeighedObservation(NamedTuple):
 
 
 class Population:
-    """The particles of a global search. See the module docstring.
+    """The particles of a global search for the robot's pose. See the module docstring.
 
     ``motion``: the odometry. ``bounds`` (2, 2) [m]: the lower and upper corner of the area that contains the robot.
-    ``start``: a known start position, or None. ``space``: the free space that contains the robot, or None.
-    ``fewest``: the minimum number of particles, at least :data:`ASTRAY`.
+    ``start``: a known start position, or None. ``space``: the free space that contains the robot, or None. ``fewest``:
+    the minimum number of particles, at least :data:`ASTRAY`.
 
     Attributes: ``log_evidence``: the log-probability of all observations if the robot's start pose is unknown.
-    ``rival_evidence``: the log-probability of the same observations if the estimator's pose (the track) is right.
-    ``newest``: the integrated odometry at the last processed observation.
+    ``rival_evidence``: the log-probability of the same observations if the estimator's pose is right. ``newest``: the
+    integrated odometry at the last processed observation.
     """
 
     at_once = False
@@ -123,19 +123,20 @@ class Population:
 
     @property
     def waits(self) -> bool:
-        """True if an observation is not yet processed completely."""
+        """True if an observation in the queue is not yet processed completely."""
         return self._running is not None or bool(self._waiting)
 
     @property
     def hypotheses(self) -> Sequence[Mode]:
-        """The modes of the particles at the last observation, most likely first."""
+        """The modes of the particles at the time of the last processed observation, most likely first."""
         if self._hypotheses is None:
             self._hypotheses = self._cloud.modes() if self._cloud is not None else ()
         return self._hypotheses
 
     @property
     def best(self) -> PosePrior | None:
-        """The robot's pose at the last observation, None if no mode meets a limit in :data:`CLEAR`."""
+        """The robot's pose at the time of the last processed observation. None if no mode meets a limit in
+        :data:`CLEAR`."""
         at = self.newest
         if at is None or all(at.t < since + lasts for since, (_, lasts) in zip(self._since, CLEAR, strict=True)):
             return None
@@ -144,12 +145,14 @@ class Population:
 
     @property
     def particles(self) -> tuple[Array, Array]:
-        """Poses (N, 3) and weights (N,) of the particles at the last observation. Empty before the first one."""
+        """Poses (N, 3) and weights (N,) of the particles at the last processed observation. Both are empty (N = 0)
+        before the first one."""
         return (self._cloud.poses, self._cloud.weights) if self._cloud is not None else (np.empty((0, 3)), np.empty(0))
 
     def add(self, odometry: ChainState, observation: Evidence, evidence: float = 0.0) -> bool:
-        """Queue an observation. The arguments are the fields of :class:`WeighedObservation`. Returns False if it is
-        ignored, because it is older than the last one in the queue."""
+        """Queue an observation. ``odometry``: the integrated odometry at its time. ``evidence``: see
+        :class:`WeighedObservation`. Returns False if the observation is ignored, because it is older than the last one
+        in the queue."""
         newest = self._waiting[-1].odometry if self._waiting else self._begun
         if newest is not None and odometry.t < newest.t:
             return False
@@ -157,8 +160,8 @@ class Population:
         return True
 
     def advance(self, work: float = math.inf) -> bool:
-        """Process queued observations until the computing cost exceeds ``work``. Returns True if at least one of them
-        was processed completely."""
+        """Process queued observations until the computing cost exceeds ``work``, in units of some nanoseconds. Returns
+        True if at least one observation was processed completely."""
         done = False
         while work > 0.0 and (self._running is not None or self._waiting):
             if self._running is None:
@@ -172,8 +175,8 @@ class Population:
         return done
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
-        """Return ``count`` random poses (N, 3) at the last observation: around :attr:`best` or, if it is None, drawn
-        from all particles. The array is empty before the first observation."""
+        """Return ``count`` random poses (N, 3) at the time of the last processed observation. They are near
+        :attr:`best` or, if it is None, drawn from all particles. The array is empty before the first observation."""
         if self._cloud is None:
             return np.empty((0, 3))
         best, weights = self.best, self._cloud.weights
@@ -181,7 +184,8 @@ class Population:
         return kld.jittered(self._cloud.poses, rows, rng)
 
     def denies(self, place: PosePrior) -> bool:
-        """True if the particles reject the pose ``place``, which must be at the time of the last observation."""
+        """Return True if almost no particles are near the pose ``place``. Returns False if its time is not that of the
+        last observation."""
         if self._informative < CLEAR_OBSERVATIONS or self.newest is None or place.t != self.newest.t:
             return False
         assert self._cloud is not None
@@ -223,7 +227,8 @@ class Population:
         ]
 
     def _weight_of_best(self) -> float:
-        """Return the probability that the robot is near the most likely mode, 0 if there are too few observations."""
+        """Return the probability that the robot is near the most likely mode. Returns 0 if there are too few
+        observations."""
         if self._informative < CLEAR_OBSERVATIONS or len(self._things) < CLEAR_THINGS or self._cloud is None:
             return 0.0
         error = self._cloud.poses - self.hypotheses[0].pose
@@ -260,12 +265,12 @@ class Population:
         return float(area) * 2.0 * math.pi
 
     def _room_of(self, count: int) -> Array:
-        """Return the volume (N,) per particle, in grid cells, if ``count`` particles are drawn from the whole space of
-        poses. Zero if the start position is known."""
+        """Return the volume (N,) per particle, in grid cells, if ``count`` particles are drawn from all possible poses.
+        Returns zeros if the start position is known."""
         return np.full(count, self._volume / float(np.prod(kld.CELL)) / count if self._start is None else 0.0)
 
     def _draw_anywhere(self, count: int, now: ChainState) -> Array:
-        """Draw ``count`` poses (N, 3) that no observation influences.
+        """Draw ``count`` poses (N, 3) without regard to observations.
 
         If the start position is known, they are drawn around it and moved by odometry to ``now``. Otherwise they are
         uniform over the free space or, if that is unknown, over the bounds (as a Latin hypercube).

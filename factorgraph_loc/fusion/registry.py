@@ -34,7 +34,7 @@ class Description:
 def settings_of(name: str, overrides: Mapping[str, Any]) -> FileModel:
     """Return the settings of the estimator ``name``: the defaults, changed by ``overrides``.
 
-    ``overrides``: values by key. A key has dots between its parts, and does not contain the estimator's name.
+    ``overrides``: values by key, such as ``lag``. The parts of a key of a nested setting are separated by dots.
 
     Raises InputError if the estimator or a key is unknown, or if a value is out of bounds.
     """
@@ -42,7 +42,8 @@ def settings_of(name: str, overrides: Mapping[str, Any]) -> FileModel:
 
 
 def create(name: str, setup: Setup, settings: FileModel) -> Estimator:
-    """Construct the estimator with this name. ``setup``: the run. ``settings``: the settings of the estimator."""
+    """Return a new estimator of the class called ``name``. ``setup``: the robot, the map, the sensors to use, and a
+    random generator. ``settings``: the settings of the estimator."""
     return cast(Estimator, estimator_type(name)(setup, settings))
 
 
@@ -61,14 +62,15 @@ def describe(name: str) -> Description:
 
 
 def _takes(kind: type[Any], channel: Channel) -> bool:
-    """True if an estimator class uses the measurements of a channel."""
+    """Return True if an estimator class uses the measurements of a channel."""
     modalities = getattr(kind, "modalities", EVERY)
     streams = channels()[parent_of(channel.name) or channel.name].streams
     return any(stream.kind.is_motion or stream.kind.modality in modalities for stream in streams)
 
 
 def check_names(names: Sequence[str]) -> None:
-    """Raise InputError if one of ``names`` is not the name of an estimator. The message proposes the most similar name."""
+    """Raise InputError if an element of ``names`` is not the name of an estimator. The message proposes the most
+    similar name."""
     for name in names:
         if name not in ESTIMATORS:
             raise InputError(f"no estimator is called {quoted(name)}{nearest(name, list(ESTIMATORS))}")

@@ -32,7 +32,8 @@ PAUSE = 0.05  # s: minimum time between two slices, so that a measurement and a 
 
 
 class Search:
-    """A global search for the robot's pose. See the module docstring.
+    """A global search for the robot's pose, by particles and by sensors that can determine a pose. See the module
+    docstring.
 
     ``sensors``: the sensors by name. ``motion``: the odometry. ``space``: the free space that contains the robot. If it
     is None, particles are drawn within the bounds of the sensors' maps. ``fewest``: the minimum number of particles.
@@ -69,15 +70,16 @@ class Search:
         return bool(self._finders) or self._weighs
 
     def serves(self, sensor: Sensor) -> bool:
-        """True if the search uses this sensor."""
+        """Return True if the search uses this sensor."""
         return sensor.name in self._sensors
 
     def remember(self) -> None:
-        """Keep odometry for longer than usual, because a later search needs it."""
+        """Store odometry for longer than usual, so that a search can begin at an earlier time."""
         self._motion.horizon = self._horizon = 2.0 * DURATION
 
     def begin(self, start: KnownPosition | None) -> None:
-        """Begin a search for the heading at a known position ``start``. If ``start`` is None, the position counts as unknown."""
+        """Begin a search for the heading at a known position ``start``. If ``start`` is None, position and heading
+        count as unknown."""
         self.start = start
         for finder in self._finders.values():
             finder.start = start
@@ -104,17 +106,19 @@ class Search:
         return self.advance(odometry.t) or is_informative
 
     def queue(self, observation: Evidence, odometry: ChainState) -> None:
-        """Queue an observation of another sensor than the search's, such as the free distances of a proximity sensor.
+        """Queue an observation that is not from a sensor of the search, such as the free distances of a proximity
+        sensor.
 
-        :meth:`advance` weighs the particles by queued observations. Before the particles have processed an observation
-        of the search's sensors, others are ignored. ``odometry``: the integrated odometry at the observation's time.
+        The particles process it in :meth:`advance`. It is ignored if they have not yet processed an observation of the
+        search's own sensors. ``odometry``: the integrated odometry at the observation's time.
         """
         if self._population is not None and self._population.newest is not None:
             self._population.add(odometry, observation)
 
     def advance(self, t: float) -> bool:
-        """Weigh the particles at time ``t`` [s] by queued observations, at a limited computing cost. Returns True if at
-        least one observation was processed completely."""
+        """Weigh the particles by queued observations, at a limited computing cost. Returns True if at least one
+        observation was processed completely. ``t`` [s]: the present time. A call soon after the previous one does
+        nothing."""
         if self._population is None or (t < self._advanced + PAUSE and self._work < math.inf):
             return False
         self._advanced = t
@@ -127,7 +131,7 @@ class Search:
 
     @property
     def best(self) -> PosePrior | None:
-        """The robot's pose at the time of the last observation, or None if no pose is clear yet."""
+        """The robot's pose at the time of the last observation, or None if no pose is certain enough yet."""
         for finder in self._finders.values():
             best = finder.best
             if best is not None and not self._denied(best):
@@ -140,12 +144,12 @@ class Search:
         return self._population is not None and self._population.waits
 
     def _denied(self, place: PosePrior) -> bool:
-        """True if the particles reject ``place``, a pose from one sensor, or have unprocessed observations."""
+        """Return True if the particles reject ``place``, a pose from one sensor, or have unprocessed observations."""
         return self._population is not None and (self._population.waits or self._population.denies(place))
 
     def modes(self, t: float) -> list[Mode]:
-        """Return the hypotheses of the pose at time ``t`` [s], most likely first. The list is empty if nothing is
-        known. With a known start position, it is never empty."""
+        """Return the hypotheses of the pose at time ``t`` [s], most likely first. The list is empty before the first
+        informative measurement. With a known start position, it is never empty."""
         now, leading = self._motion.state(t), self._leading
         if leading is None or leading.newest is None or not leading.hypotheses:
             return [] if self.start is None else [self.start.mode(now)]
@@ -156,7 +160,8 @@ class Search:
         ]
 
     def particles(self, t: float) -> tuple[Array, Array] | None:
-        """Return poses (N, 3) at time ``t`` [s] and weights (N,) of the particles, None if the result is a finder's."""
+        """Return poses (N, 3) at time ``t`` [s] and weights (N,) of the particles. Returns None if the result of the
+        search is not from particles."""
         leading = self._leading
         if not isinstance(leading, Population) or leading.newest is None:
             return None
@@ -164,8 +169,9 @@ class Search:
         return se2.compose(poses, self._motion.relative(leading.newest, self._motion.state(t)).delta), weights
 
     def sample(self, rng: np.random.Generator, count: int, now: ChainState) -> tuple[Array, ChainState] | None:
-        """Draw ``count`` poses from the result of the search. Returns poses (N, 3) and the integrated odometry at their
-        time, which is not later than ``now``. Returns None before the first informative measurement."""
+        """Return ``count`` random poses (N, 3) from the result of the search, and the integrated odometry at their
+        time. This time is at most that of ``now``, the present odometry. Returns None before the first informative
+        measurement."""
         leading = self._leading
         if leading is None:
             return None
@@ -173,7 +179,7 @@ class Search:
         return poses, now if reached is None or reached.t >= now.t else reached
 
     def end(self) -> None:
-        """End the search and delete its measurements, because the pose is known."""
+        """End the search and delete its measurements. Call this when the pose is known."""
         self.begin(None)
         for finder in self._finders.values():
             finder.clear()
@@ -181,8 +187,8 @@ class Search:
 
     @property
     def _leading(self) -> Finder | Population | None:
-        """The source of the present result, None if no source has a result. A finder uses one sensor alone. The order
-        of preference is: a finder that needs only one measurement, the particles, any other finder."""
+        """The source of the present result, None if there is no result. A finder computes a pose from one sensor alone.
+        The order of preference is: a finder that needs only one measurement, the particles, any other finder."""
         informative = [finder for finder in self._finders.values() if finder.newest is not None]
         for finder in informative:
             if finder.at_once and (self._population is None or finder.best is not None):
@@ -192,7 +198,7 @@ class Search:
         return next(iter(informative), None)
 
     def _is_due(self, sensor: Sensor, t: float) -> bool:
-        """True if the particles need an observation of this sensor at ``t`` [s], long enough after their last one."""
+        """Return True if the particles' last observation of this sensor is old enough at ``t`` [s] for another one."""
         last = self._last.get(sensor.name, -math.inf)
         if t <= last or t < last + sensor.evidence_every:
             return False

@@ -34,7 +34,8 @@ LEAST = np.diag((1e-4, 1e-4, 1e-4)) ** 2
 
 
 class SwitchingSettings(FilterSettings):
-    """Settings of the estimator that switches between a particle filter and an EKF."""
+    """Settings of the estimator ``Switching``, which uses a particle filter while RFID tags are read, otherwise
+    an EKF."""
 
     particles: Annotated[int, Field(ge=10, le=1_000_000)] = 5000
     """number of particles of the particle filter"""
@@ -42,8 +43,8 @@ class SwitchingSettings(FilterSettings):
 
 @dataclass(frozen=True)
 class _PoseBelief:
-    """The causal estimate at one time: ``pose`` (3,) with its body-frame ``covariance`` (3, 3). ``odometry``: the
-    integrated odometry at that time."""
+    """An estimate during the run: ``pose`` (3,) with its body-frame ``covariance`` (3, 3). ``odometry``: the integrated
+    odometry at its time."""
 
     odometry: ChainState
     pose: Array
@@ -115,11 +116,11 @@ class Switching:
             self.diagnostics.ignore("landmarks while tags are read")
 
     def estimate(self, t: float | None = None) -> PoseEstimate:
-        """Return the estimate of the active filter."""
+        """Return the estimate of the filter in use: at its newest measurement or, if later, at ``t`` [s]."""
         return self._active.estimate(t)
 
     def belief(self, t: float | None = None) -> Belief:
-        """Return the belief of the active filter."""
+        """Return the probability distribution of the pose from the filter in use, at the time of :meth:`estimate`."""
         return self._active.belief(t)
 
     def learnt(self) -> Learnt:
@@ -127,7 +128,8 @@ class Switching:
         return Learnt()
 
     def trajectory(self) -> Trajectory:
-        """Return the smoothed poses, or the causal poses if the setting ``smooth`` is false."""
+        """Return the smoothed poses at the recorded times, or the estimates during the run if the setting ``smooth`` is
+        false."""
         times = sorted(self._records)
         records = [self._records[t] for t in times]
         track = [(r.pose, r.covariance) for r in records[-1:]]
@@ -147,7 +149,8 @@ class Switching:
         self._records = {t: record for t, record in self._records.items() if t >= until}
 
     def _hand_over(self, successor: Filter) -> None:
-        """Make ``successor`` the active filter, starting at the present pose, if the active filter is localized."""
+        """Replace the filter in use by ``successor``, which starts at the present pose. Nothing happens if the pose is
+        not localized."""
         if successor is self._active:
             return
         now = self._active.estimate()
@@ -165,7 +168,7 @@ class Switching:
 
 def _smoothed(record: _PoseBelief, step: Increment, later: tuple[Array, Array]) -> tuple[Array, Array]:
     """Return the smoothed pose (3,) and covariance (3, 3) of ``record``. ``step``: the motion to the next record.
-    ``later``: the smoothed pose and covariance of the next record. If the next pose does not follow from ``record``,
+    ``later``: the smoothed pose and covariance of the next record. If these contradict ``record`` and ``step``,
     ``record`` is not smoothed."""
     predicted = propagate(record.covariance, step)
     error = se2.log(se2.between(se2.compose(record.pose, step.delta), later[0]))

@@ -30,7 +30,8 @@ from factors.motion import Increment
 
 class Taken(NamedTuple):
     """A processed measurement. ``checkpoint``: the estimator's state before the measurement, None if it is not needed.
-    ``added``: what the measurement added to the diagnostics, to remove it again if the measurement is replayed."""
+    ``added``: the entries that the measurement added to the diagnostics, to remove them if the measurement is processed
+    again."""
 
     measurement: Measurement
     checkpoint: Any = None
@@ -38,7 +39,7 @@ class Taken(NamedTuple):
 
 
 class Timeline(ABC):
-    """The base class of estimators that process measurements in order of time."""
+    """The base class of estimators that process measurements in order of time. Late measurements are also allowed."""
 
     deterministic = True
     takes_rows = True  # one measurement may contain several rows of odometry
@@ -70,9 +71,9 @@ class Timeline(ABC):
     def estimate(self, t: float | None = None) -> PoseEstimate:
         """Return the pose at the time of the newest measurement or recorded pose, or at ``t`` [s] if that is later.
 
-        Before the start, the estimate is the most likely hypothesis of the search, with the status ``ambiguous``. If
-        there is none, it is NaN, with the status ``unlocalized``. After the start, the status is ``ambiguous`` while a
-        search is in progress, and while the estimated poses do not explain the measurements.
+        Before the start, the estimate is the most likely result of the search for the start pose, with the status
+        ``ambiguous``. If there is none, it is NaN, with the status ``unlocalized``. After the start, the status is
+        ``ambiguous`` while a search is in progress, and while the estimated poses contradict the measurements.
         """
         if self._begun < math.inf:
             estimate = self._estimate_at(t)
@@ -85,8 +86,8 @@ class Timeline(ABC):
         return PoseEstimate(at, modes[0].pose, modes[0].covariance, "ambiguous")
 
     def belief(self, t: float | None = None) -> Belief:
-        """Return the probability distribution behind :meth:`estimate`. Before the start it has all hypotheses of the
-        search, and the search's particles."""
+        """Return the probability distribution of the pose, at the same time as :meth:`estimate`. Before the start, it
+        has all hypotheses of the search for the start pose, and the particles of this search."""
         if self._begun < math.inf or self._seeking is None:
             return gaussian_belief(self.estimate(t))
         at = self._t if t is None else max(t, self._t)
@@ -99,7 +100,7 @@ class Timeline(ABC):
 
     @abstractmethod
     def _estimate_at(self, t: float | None) -> PoseEstimate:
-        """Compute :meth:`estimate` after the start."""
+        """Return the result of :meth:`estimate` after the start."""
 
     @abstractmethod
     def _process(self, m: Measurement) -> None:
@@ -110,7 +111,7 @@ class Timeline(ABC):
         return
 
     def _uses(self, m: Measurement) -> bool:
-        """True if the estimator uses the sensor of the measurement."""
+        """Return True if the estimator uses the sensor of the measurement."""
         return m.source in self._sensors
 
     def _begin(self, m: Measurement) -> None:
@@ -124,7 +125,7 @@ class Timeline(ABC):
         search.begin(KnownPosition(prior, self._motion))
 
     def _seek_start(self, m: Measurement, search: Tracking) -> None:
-        """Update the search for the start pose by the measurement ``m``. If this gives one clear pose, start the
+        """Update the search for the start pose by the measurement ``m``. If this determines the pose, start the
         estimator there and process all measurements since the start again."""
         start = search.start
         if start is not None:
@@ -150,7 +151,7 @@ class Timeline(ABC):
         self._replay(again)
 
     def _prior(self, t: float, best: PosePrior, moved: Increment, start: KnownPosition | None) -> PosePrior:
-        """Return the prior for a start at time ``t`` [s], from the result of the search.
+        """Return the prior for a start at time ``t`` [s], computed from the result of a search.
 
         ``best``: the pose that the search found, at a later time. ``moved``: the robot's motion from ``t`` to that
         time. ``start``: the known position at ``t``, or None.
@@ -163,13 +164,15 @@ class Timeline(ABC):
             self._process(m)
 
     def _remember(self, taken: Taken, span: float) -> None:
-        """Store the processed measurement ``taken``, and delete stored ones that are more than ``span`` [s] older."""
+        """Store the processed measurement ``taken``. Stored measurements that are more than ``span`` [s] older are
+        deleted."""
         self._taken.append(taken)
         while self._taken[0].measurement.t < taken.measurement.t - span:
             self._taken.popleft()
 
     def _take_back(self, t: float) -> list[Measurement]:
-        """Undo all measurements from time ``t`` [s] on. Returns these measurements in the order of their times."""
+        """Undo the processing of all measurements from time ``t`` [s] on. Returns these measurements in the order of
+        their times."""
         undone = [taken for taken in self._taken if taken.measurement.t >= t]
         self._taken = deque(taken for taken in self._taken if taken.measurement.t < t)
         for taken in reversed(undone):

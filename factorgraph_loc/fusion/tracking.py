@@ -68,7 +68,7 @@ SPARE = 1e-3  # s: a gap exceeds MAX_GAP by at least this much
 
 
 def is_known(t: Array, changes: Iterable[Change]) -> NDArray[np.bool_]:
-    """Return a mask (N,) of the times ``t`` (N,) [s] outside of ``changes``, the intervals with a carried robot."""
+    """Return a mask (N,) of the times ``t`` (N,) [s] outside of all ``changes``, intervals with a carried robot."""
     known = np.ones(len(t), dtype=bool)
     for last, first in changes:
         more = 0.5 * max(MAX_GAP + SPARE - (first - last), 0.0)
@@ -83,8 +83,8 @@ SLIPS = "the odometry contradicts the observations since {since:.1f} s: the moti
 
 
 class Tracked(NamedTuple):
-    """The newest estimated pose of an estimator: ``pose`` (3,) with body-frame ``covariance`` (3, 3), and the
-    integrated ``odometry`` at its time."""
+    """The newest estimate of the pose. ``pose`` (3,), ``covariance`` (3, 3): its mean, and its covariance in the body
+    frame. ``odometry``: the integrated odometry at its time."""
 
     odometry: ChainState
     pose: Array
@@ -92,10 +92,10 @@ class Tracked(NamedTuple):
 
 
 class Refuted(NamedTuple):
-    """The rejection of a track (the estimated poses since the last start), because observations contradict it.
+    """The rejection of an estimator's poses since ``since`` [s], because observations contradict them.
 
-    ``why``: the reason, for messages. ``since`` [s]: the track is wrong from this time on. ``change``: the interval
-    when the robot left the track. ``extra_covariance`` (3, 3): is added to the body-frame covariance of the new pose.
+    ``why``: the reason, for messages. ``change``: the interval (start, end) [s] that contains the time when the
+    estimates became wrong. ``extra_covariance`` (3, 3): is added to the body-frame covariance of the new pose.
     """
 
     why: str
@@ -105,7 +105,7 @@ class Refuted(NamedTuple):
 
 
 class Tracking(Search):
-    """A search that also tests whether observations contradict the track (the estimated poses of the robot)."""
+    """A global search that also tests whether observations contradict the track (the estimated poses of the robot)."""
 
     def __init__(
         self, sensors: Mapping[str, Sensor], motion: Motion, rng: np.random.Generator, diagnostics: Diagnostics
@@ -118,10 +118,10 @@ class Tracking(Search):
         self._rejected = -math.inf  # s; time of the last rejection of a track by particles
 
     def is_unsure(self, t: float, covariance: Array) -> bool:
-        """True if the estimated pose at ``t`` [s], with ``covariance`` (3, 3), should not be reported as localized.
+        """Return True if the pose at ``t`` [s], with ``covariance`` (3, 3), should not be reported as localized.
 
-        There are three reasons: the position error exceeds :data:`NEAR` with a probability above 1 - :data:`SURE`, the
-        motion is unknown, or the previous track was rejected less than :data:`PROBATION` ago.
+        There are three possible reasons. The position error exceeds :data:`NEAR` with a probability above 1 -
+        :data:`SURE`. The motion is unknown. Earlier estimates were rejected less than :data:`PROBATION` ago.
         """
         if self._motion.is_slipping or self._rejected <= t < self._rejected + PROBATION:
             return True
@@ -130,12 +130,13 @@ class Tracking(Search):
 
     @property
     def doubts(self) -> bool:
-        """True if the measurements of any sensor contradict the track (the estimated poses)."""
+        """True if the measurements of any sensor contradict the estimated poses."""
         return is_doubted(self._sensors.values())
 
     def expect(self, sensor: Sensor, observation: Observation, odometry: ChainState, view: View) -> None:
-        """Process an observation before it corrects the pose. Some sensors check the track with it. ``view``: the
-        estimator's state."""
+        """Process an observation that will correct the pose. A sensor that can determine a pose alone checks the
+        estimated poses with it. ``odometry``: the integrated odometry at its time. ``view``: gives access to the
+        estimator's state before the correction."""
         if sensor.finder is not None:
             sensor.finder.follow(observation, odometry, view)
             self._looked.append(odometry.t)
@@ -145,8 +146,9 @@ class Tracking(Search):
     def keep(
         self, sensor: Sensor, observation: Observation, odometry: ChainState, evidence: Callable[[], float]
     ) -> None:
-        """Store an observation for a later search, after it has corrected the estimated pose. ``evidence()``: returns
-        the log-probability of the observation if the estimated pose (the track) is right."""
+        """Store an observation that has corrected the estimated pose, for a global search that may become necessary.
+        ``odometry``: the integrated odometry at its time. ``evidence()``: returns the log-probability of the
+        observation if the estimated pose is right."""
         current = observation.at_its_time() if self._weighs else None
         if current is None or not self._is_due(sensor, odometry.t):
             return
@@ -157,11 +159,11 @@ class Tracking(Search):
             self._population.add(*self._kept[-1])
 
     def refuted(self, m: Any, track: Callable[[], Tracked], pose_at: Callable[[float, Array], Array]) -> Refuted | None:
-        """Return the rejection of the track, None if it is not rejected. Call this after each measurement.
+        """Return the reason to reject the track (the estimated poses), or None. Call this after each measurement.
 
         If the track is rejected, :attr:`best` is the robot's pose. ``m``: the measurement, or the time of a recorded
-        pose. ``track()``: returns the estimate of the track at that time. ``pose_at(t, best)``: returns the robot's
-        pose (3,) at an earlier time ``t`` [s] if the robot is at ``best`` (3,) now.
+        pose. ``track()``: returns the estimated pose at that time. ``pose_at(t, best)``: returns the robot's pose (3,)
+        at an earlier time ``t`` [s] if the robot is at ``best`` (3,) now.
         """
         if isinstance(m, Tick) and not self.waits:
             return None
@@ -201,7 +203,8 @@ class Tracking(Search):
         return Refuted(next(iter(doubting)).lost, *self._change(best, pose_at), FOUND)
 
     def brought(self, best: PosePrior, now: ChainState) -> PosePrior:
-        """Return ``best``, a pose of the search, moved by odometry to the later time of the odometry state ``now``."""
+        """Return ``best``, a pose from the search, predicted by odometry to a later time. ``now``: the integrated
+        odometry at that time."""
         if best.t >= now.t:
             return best
         since = self._motion.relative(self._motion.state(best.t), now)
@@ -209,7 +212,7 @@ class Tracking(Search):
         return PosePrior(now.t, pose, best.covariance + se2.body_to_world(pose, since.covariance))
 
     def _change(self, best: PosePrior, pose_at: Callable[[float, Array], Array]) -> tuple[float, Change]:
-        """Find when the robot left the track. Returns the most likely time [s], and the interval that contains it.
+        """Return the most likely time [s] of the track's (the estimated poses') first error, and an interval around it.
 
         ``best``: the robot's present pose. Observations before that time are more likely given the track, later ones
         given ``best``.
@@ -233,7 +236,7 @@ class Tracking(Search):
 
     def begin_track(self, *, by_search: bool) -> None:
         """End the search, because the estimator continues at a new pose. ``by_search``: True if the search found this
-        pose, so that the estimator processes the stored observations again. False if a prior gave the pose."""
+        pose, so that the estimator processes the stored observations again. False if the pose is from a prior."""
         self.end()
         if by_search:
             self._kept.clear()
@@ -241,11 +244,11 @@ class Tracking(Search):
 
 
 class _Compared(NamedTuple):
-    """An observation that has corrected the estimated pose. Alternative motions are compared on these observations.
+    """An observation that has corrected the estimated pose, to test the odometry against alternative motions.
 
-    ``odometry``: the integrated odometry at its time. ``observed()``: returns the observation on the pose at that time,
-    or None. ``pose`` (3,), ``covariance`` (3, 3): the predicted pose and its body-frame covariance. ``offset``: the
-    motion from that pose to the observation, or None. ``correction``: the correction by the observation.
+    ``odometry``: the integrated odometry at its time. ``observed()``: returns the observation as a function of its
+    pose, or None. ``pose`` (3,), ``covariance`` (3, 3): the predicted pose and its body-frame covariance. ``offset``:
+    the motion from that pose to the observation, or None. ``correction``: by the observation.
     """
 
     odometry: ChainState
@@ -256,8 +259,8 @@ class _Compared(NamedTuple):
     correction: Correction
 
     def fit(self, observation: Observation) -> float:
-        """Return the log-likelihood of the observation given the track: at the corrected pose, minus half the squared
-        Mahalanobis distance of the correction."""
+        """Return the log-likelihood of the observation at the corrected pose, minus half the squared Mahalanobis
+        distance of the correction."""
         delta = self.correction.delta[:3]
         moved = float(positive.squared(delta, self.covariance))
         return float(observation.log_likelihood(self.corrected()[None], {})[0]) - 0.5 * moved
@@ -280,10 +283,10 @@ class SlipMonitor:
     def add(
         self, observed: Callable[[], Observation | None], odometry: ChainState, view: View, correction: Correction
     ) -> None:
-        """Process an observation that has corrected a track.
+        """Process an observation that has corrected the estimated pose.
 
         ``observed()``: returns the observation as a function of the pose at its own time, or None. ``odometry``: the
-        integrated odometry at that time. ``view``: the estimator's state before the correction.
+        integrated odometry at that time. ``view``: gives access to the estimator's state before the correction.
         """
         t = odometry.t
         # a late measurement: remove the later observations, because they will be processed again
@@ -307,12 +310,13 @@ class SlipMonitor:
                 self._compared = t
 
     def _are_surprising(self, t: float) -> bool:
-        """True if the observations of the last seconds together are more surprising than random errors explain."""
+        """Return True if the last observations together differ more from their predictions than random errors do."""
         newest = [surprise(row.correction) for row in self._rows if row.odometry.t >= t - WINDOW / 2.0]
         return sum(newest) > SURPRISING * math.sqrt(len(newest))
 
     def _log_odds(self, begin: float) -> tuple[float, float]:
-        """Return the log-odds that the odometry is wrong since about ``begin`` [s], and the time when the error begins.
+        """Return the log-odds that the odometry is wrong since about ``begin`` [s], and the time [s] of the first
+        error.
 
         This is the time of the first observation from ``begin`` on that agrees with its prediction. The log-odds are
         zero with too few observations or too little motion.
@@ -347,27 +351,29 @@ class SlipMonitor:
 
 
 def surprise(correction: Correction) -> float:
-    """Return the excess of a correction's innovation over its expected size, in standard deviations."""
+    """Return how far a correction's squared innovation, or its negative log-likelihood, exceeds the expected value. The
+    unit is the standard deviation."""
     if correction.dof:
         return (correction.nis - correction.dof) / math.sqrt(2.0 * correction.dof)
     return correction.excess_nll / math.sqrt(correction.variance) if correction.variance > 0.0 else 0.0
 
 
 def is_doubted(sensors: Iterable[Sensor]) -> bool:
-    """True if the measurements of a sensor contradict the track, or if a sensor detects nothing where it should."""
+    """Return True if a sensor's measurements contradict the estimated poses, or if it detects nothing where it
+    should."""
     return any(sensor.suspicious_since is not None or sensor.silent for sensor in sensors)
 
 
 def _is_apart(best: PosePrior, pose: Array, covariance: Array) -> bool:
-    """True if the pose ``best`` differs from a track's ``pose`` (3,) with body-frame ``covariance`` (3, 3)."""
+    """Return True if ``best`` differs significantly from a ``pose`` (3,) with body-frame ``covariance`` (3, 3)."""
     error = se2.log(se2.between(pose, best.pose))
     combined = covariance + se2.world_to_body(best.pose, best.covariance)
     return float(error @ positive.solve(combined, error[:, None])[:, 0]) > APART
 
 
 def beyond(covariance: Array, distance: float) -> float:
-    """Return the probability that the position of a Gaussian pose with ``covariance`` (3, 3) differs from its mean by
-    more than ``distance`` [m]."""
+    """Return the probability that a Gaussian position differs from its mean by more than ``distance`` [m].
+    ``covariance`` (3, 3): of (x, y, heading) [m, m, rad]."""
     angle = math.pi * np.arange(180) / 180.0
     direction = np.column_stack((np.cos(angle), np.sin(angle)))
     curvature = np.einsum("ni,ij,nj->n", direction, np.linalg.inv(covariance[:2, :2]), direction)
@@ -376,7 +382,7 @@ def beyond(covariance: Array, distance: float) -> float:
 
 
 def laplace_evidence(observation: Observation, pose: Array, covariance: Array, correction: Correction) -> float:
-    """Return the marginal log-likelihood of an observation under a Gaussian prediction, by Laplace's method.
+    """Return the log-likelihood of an observation, marginalised over a Gaussian prediction by Laplace's method.
 
     ``observation``: depends on the pose only. ``pose`` (3,), ``covariance`` (3, 3): the prediction and its body-frame
     covariance. ``correction``: the correction of this prediction by the observation.

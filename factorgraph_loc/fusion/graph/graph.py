@@ -140,8 +140,7 @@ class Mapper:
         return guess
 
     def is_astray(self, node: Node, values: Values) -> bool:
-        """Return True if ``node`` is the observation of a point, and certainly a false match given the estimates
-        ``values``."""
+        """Return True if ``node`` observes a point, and certainly is a false match given the estimates ``values``."""
         return False
 
     def point(self, node: Node) -> int | None:
@@ -223,16 +222,14 @@ class Graph:
         self.keyframes[keyframe.index] = self.newest = keyframe
 
     def cut(self, first: int, t: float) -> None:
-        """Remove keyframe ``first`` and all later ones. The trajectory is removed from it or, if earlier, from ``t``
-        [s] on."""
+        """Remove keyframe ``first`` and all later ones. The trajectory is cut there or, if earlier, at ``t`` [s]."""
         for index in range(first, self.newest.index + 1):
             del self.keyframes[index]
         self.newest = self.keyframes[first - 1]
         self.ticks = [tick for tick in self.ticks if tick.keyframe < first and tick.t < t]
 
     def forget(self, first: int) -> None:
-        """Delete the keyframes before number ``first``, the trajectory before it, and points that are not observed
-        since."""
+        """Delete the keyframes before number ``first``, the trajectory before it, and points not observed since it."""
         for index in range(next(iter(self.keyframes)), first):
             del self.keyframes[index]
         self.ticks = [tick for tick in self.ticks if tick.keyframe >= first]
@@ -270,8 +267,8 @@ class Graph:
         return poses[0], bodies[0], worlds[0]
 
     def all_moved(self, times: Sequence[float]) -> tuple[Array, Array, Array, Array]:
-        """Predict the newest pose by odometry to each of K later ``times`` [s]. Returns the odometry states (K, 8), the
-        poses (K, 3), and the covariances (K, 3, 3) of these poses in the body frame and in the world frame."""
+        """Predict the newest pose by odometry to each of K later ``times`` [s]. Returns the odometry states (K, 8) and
+        the poses (K, 3). Also returns the poses' covariances (K, 3, 3) in the body frame and in the world frame."""
         start = self.newest.odometry if self.is_anchored else self.motion.state(self.newest.t)
         return self.motion.moved(start, times, self.pose, self.covariance, self.value(MOTION, NOTHING_KNOWN))
 
