@@ -29,9 +29,9 @@ System = tuple[Array, Array, Array, Array]
 
 @compiled
 def normal(count: int, first: Integers, jacobian: Array, residual: Array) -> System:
-    """Return the normal equations of ``count`` poses and P parameters, from M residuals. ``first`` (M,): the index of
-    the first pose that each residual depends on. ``jacobian`` (M, 6 + P): the derivatives of the residuals with respect
-    to this pose, the next pose, and the parameters."""
+    """Return the normal equations of ``count`` poses and P parameters, from M residuals (M,), see :data:`System`.
+    ``first`` (M,): the index of the first pose that each residual depends on. ``jacobian`` (M, 6 + P): the derivatives
+    of the residuals with respect to this pose, the next pose, and the parameters."""
     shared = jacobian.shape[1] - 2 * POSE
     own, coupling = np.zeros((count, POSE, POSE)), np.zeros((count, POSE, POSE))
     side, corner = np.zeros((count, POSE, shared + 1)), np.zeros((shared + 1, shared + 1))
@@ -86,7 +86,8 @@ def _inverted(block: Array, out: Array) -> bool:
 
 @compiled
 def _subtract(left: Array, right: Array, out: Array) -> None:
-    """Subtract the matrix product of the transpose of ``left`` (3, C) and ``right`` (3, D) from ``out`` (C, D), in place."""
+    """Subtract the matrix product of the transpose of ``left`` (3, C) and ``right`` (3, D) from ``out`` (C, D), in
+    place."""
     for a in range(POSE):
         for j in range(left.shape[1]):
             for k in range(right.shape[1]):
@@ -124,10 +125,11 @@ def _eliminated(system: System, damping: float) -> tuple[bool, Array, Array, Arr
 
 @compiled
 def solved(system: System, damping: float) -> tuple[bool, Array, Array]:
-    """Solve the equations ``system`` for one damped step. The diagonal of the information is multiplied by ``1 + damping``.
+    """Solve the normal equations ``system`` for one damped step. The diagonal of the information is multiplied by ``1 +
+    damping``.
 
-    Returns True if the poses are determined, the step of the poses (N, 3), and the step of the parameters (P,). The
-    steps are zero if the first value is False. Raises LinAlgError if the parameters are not determined.
+    The results are True if the poses are determined, the step of the poses (N, 3), and the step of the parameters (P,).
+    The steps are zero if the first value is False. Raises LinAlgError if the parameters are not determined.
     """
     solvable, _, by_next, by_side, left = _eliminated(system, damping)
     shared, poses = len(left) - 1, np.zeros((len(by_side), POSE))

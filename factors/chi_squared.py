@@ -8,10 +8,11 @@ from factors.se2 import Array
 
 
 def quantile(probability: ArrayLike, dof: ArrayLike) -> Array:
-    """The value that a chi-square variable with ``dof`` degrees of freedom does not exceed with this ``probability``."""
+    """Return the value that a chi-square variable with ``dof`` degrees of freedom does not exceed with this
+    ``probability``."""
     return np.asarray(scipy.special.chdtri(dof, 1.0 - np.asarray(probability)))
 
 
 def survival(value: ArrayLike, dof: ArrayLike) -> Array:
-    """The probability that a chi-square variable with ``dof`` degrees of freedom exceeds ``value``."""
+    """Return the probability that a chi-square variable with ``dof`` degrees of freedom exceeds ``value``."""
     return np.asarray(scipy.special.chdtrc(dof, value))

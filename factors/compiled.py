@@ -29,10 +29,10 @@ def compiled(**options: Any) -> Callable[[Function], Function]: ...
 
 
 def compiled(function: Any = None, /, **options: Any) -> Any:
-    """Compile a function with ``numba.njit`` and these options. A decorator, with or without arguments.
+    """Compile a function with ``numba.njit`` and these ``options``. Use it as a decorator, with or without arguments.
 
-    The compiled code is cached next to the function's file, or in the user's cache folder if the former is not
-    writable. If neither is writable, each process compiles the function.
+    The compiled code is cached next to the function's file. If that folder is not writable, it is cached in the user's
+    cache folder. If neither is writable, each process compiles the function.
     """
     if function is None:
         return lambda decorated: _compiled(decorated, options)
@@ -93,11 +93,12 @@ class _Shared(FunctionCache):
             return
 
     def _place(self) -> int:
-        """The offset of this function's byte in the lock file. The functions of a folder share one lock file."""
+        """Return the offset of this function's byte in the lock file. The functions of a folder share one lock file."""
         return zlib.crc32(self._impl.filename_base.encode())
 
 
 @cache
 def _locks(folder: str) -> int:
-    """The file descriptor of the lock file of a folder. The file stays open, because closing it releases all locks."""
+    """Return the file descriptor of a folder's lock file. The file stays open, because closing it releases all
+    locks."""
     return os.open(Path(folder) / "compiling.lock", os.O_RDWR | os.O_CREAT, 0o666)

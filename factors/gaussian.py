@@ -17,7 +17,7 @@ SKEW = 1e-7
 
 @compiled(error_model="numpy")
 def product(left: Array, right: Array) -> Array:
-    """The matrix product (M, N) of ``left`` (M, K) and ``right`` (K, N)."""
+    """Return the matrix product (M, N) of ``left`` (M, K) and ``right`` (K, N)."""
     out = np.zeros((left.shape[0], right.shape[1]))
     for i in range(left.shape[0]):
         for k in range(left.shape[1]):
@@ -28,7 +28,7 @@ def product(left: Array, right: Array) -> Array:
 
 @compiled(error_model="numpy")
 def product_by_transpose(left: Array, right: Array) -> Array:
-    """The matrix product (M, N) of ``left`` (M, K) and the transpose of ``right`` (N, K)."""
+    """Return the matrix product (M, N) of ``left`` (M, K) and the transpose of ``right`` (N, K)."""
     out = np.zeros((left.shape[0], right.shape[0]))
     for i in range(left.shape[0]):
         for j in range(right.shape[0]):
@@ -91,14 +91,15 @@ def put(matrix: Array, out: Array) -> None:
 
 @compiled
 def inverse(matrix: Array) -> Array:
-    """The inverse of a matrix (D, D). Raises LinAlgError if the matrix is singular."""
+    """Return the inverse of a matrix (D, D). Raises LinAlgError if the matrix is singular."""
     return solved(matrix, np.eye(len(matrix)))[0]
 
 
 @compiled(error_model="numpy")
 def cholesky(covariance: Array) -> tuple[Array, bool]:
-    """The lower Cholesky root (D, D) of a covariance (D, D), and True if the covariance is positive definite. If the
-    second value is False, the first is undefined. The elements above the diagonal of the covariance are ignored."""
+    """Return the lower Cholesky factor (D, D) of a covariance (D, D), and True if the covariance is positive definite.
+    If the second value is False, the first is undefined. The elements above the diagonal of the covariance are
+    ignored."""
     size = len(covariance)
     out = np.zeros((size, size))
     for i in range(size):
@@ -117,7 +118,7 @@ def cholesky(covariance: Array) -> tuple[Array, bool]:
 
 @compiled(error_model="numpy")
 def invert_covariance(covariance: Array) -> Array:
-    """The inverse of a covariance (D, D). The elements above its diagonal are ignored. Raises LinAlgError if the
+    """Return the inverse of a covariance (D, D). The elements above its diagonal are ignored. Raises LinAlgError if the
     covariance is not positive definite."""
     size = len(covariance)
     lower, exists = cholesky(covariance)
@@ -142,10 +143,12 @@ def invert_covariance(covariance: Array) -> Array:
 
 @compiled
 def predicted(covariance: Array, transition: Array, noise: Array) -> Array:
-    """Predict a ``covariance`` (S, S) over one step: ``F covariance F^T + Q``.
+    """Predict a ``covariance`` (S, S) over one step. Returns ``F covariance F^T + Q`` (S, S).
 
-    ``transition`` (R, S): the first R rows of the transition matrix F. Its last S - R rows are the last rows of an identity matrix.
-    ``noise`` (R, R): the covariance Q of the process noise of the first R components. The other components have no process noise.
+    ``transition`` (R, S): the first R rows of the transition matrix F. Its other S - R rows are those of an identity
+    matrix.
+    ``noise`` (R, R): the covariance Q of the process noise of the first R components. The other components have no
+    process noise.
     """
     rows, moved, out = len(transition), product(transition, covariance), covariance.copy()
     own = product_by_transpose(moved, transition)

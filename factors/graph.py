@@ -37,33 +37,33 @@ _CHARACTER = 56  # number of bits of a key below the character, which denotes th
 
 
 def pose_key(index: int) -> int:
-    """The key of the pose of keyframe ``index``."""
+    """Return the key of the pose of keyframe ``index``."""
     return int(gtsam.symbol("x", index))
 
 
 def tilt_key(index: int) -> int:
-    """The key of the tilt of the robot at keyframe ``index``."""
+    """Return the key of the robot's roll and pitch at keyframe ``index``."""
     return int(gtsam.symbol("t", index))
 
 
 def constants_key(index: int) -> int:
-    """The key of the estimated constants of sensor number ``index``."""
+    """Return the key of the estimated constants of sensor number ``index``."""
     return int(gtsam.symbol("c", index))
 
 
 def landmark_key(index: int) -> int:
-    """The key of landmark number ``index``, in order of first detection."""
+    """Return the key of landmark number ``index``, in order of first detection."""
     return int(gtsam.symbol("l", index))
 
 
 def point_key(index: int) -> int:
-    """The key of point number ``index`` in space, in order of addition to the graph."""
+    """Return the key of point number ``index`` in space, in order of addition to the graph."""
     return int(gtsam.symbol("p", index))
 
 
 def leaving_key(index: int) -> int:
-    """The key of auxiliary variable number ``index``. A fixed-lag smoother marginalises such a variable in the update
-    that adds it."""
+    """Return the key of auxiliary variable number ``index``. A fixed-lag smoother marginalises such a variable in the
+    same update that adds it."""
     return int(gtsam.symbol("q", index))
 
 
@@ -88,7 +88,8 @@ def is_place(key: int) -> bool:
 
 
 def is_of_keyframe(key: int) -> bool:
-    """True if ``key`` is the key of a pose or a tilt. A fixed-lag smoother removes these together with their keyframe."""
+    """True if ``key`` is the key of a pose or of roll and pitch. A fixed-lag smoother removes these together with their
+    keyframe."""
     return key >> _CHARACTER in (_POSE, _TILT)
 
 
@@ -103,14 +104,14 @@ def index_of(key: int) -> int:
 
 
 class Factor(Protocol):
-    """The interface of factors for :func:`jacobian_factors`."""
+    """The interface of factors that :func:`jacobian_factors` converts to linear factors of GTSAM."""
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Return the whitened residual (m,) and one Jacobian (m, d) for each variable, at the ``values`` of the
-        variables. Both include the square root of the robust weight, if there is one."""
+        """Return the whitened residual (m,) and one Jacobian (m, d) for each variable. ``values``: the value (d,) of
+        each variable. Both results include the square root of the robust weight, if there is one."""
 
     def cost(self, values: Sequence[Array]) -> float:
-        """Return the cost at the values of the variables. It includes the robust loss, if there is one."""
+        """Return the cost at the ``values`` (d,) of the variables. It includes the robust loss, if there is one."""
 
 
 class Stack(Protocol):
@@ -139,19 +140,19 @@ class Stackable(Factor, Protocol):
 
     @property
     def kind(self) -> Hashable:
-        """Factors of one class can be in one stack if they have equal ``kind`` and the same parameters. None if the
-        factor must be linearised alone."""
+        """A hashable key. Factors of one class can be in one stack if they have equal keys and the same parameters.
+        None if the factor must be linearised alone."""
 
     def stack(self, factors: Sequence[Any], numbers: Sequence[int], column: int) -> Stack:
         """Combine ``factors`` of this type and kind into one stack.
 
-        ``numbers``: for each factor, the index of the (first) pose that it depends on. ``column``: the index in the
-        parameters (P,) of the graph at which the parameters of these factors start.
+        ``numbers``: for each factor, the index of its pose. If it has two consecutive poses, this is the first.
+        ``column``: the index of the first parameter of these factors in the parameters (P,) of the graph.
         """
 
 
 def pose_array(pose: gtsam.Pose2) -> Array:
-    """A ``gtsam.Pose2`` as (x, y, heading)."""
+    """Return a ``gtsam.Pose2`` as an array (x, y, heading) [m, m, rad]."""
     return np.array((pose.x(), pose.y(), pose.theta()))
 
 
@@ -191,8 +192,8 @@ def jacobian_factors(
 
 
 def gaussian_factor(keys: Sequence[int], residual: Array, blocks: Sequence[Array]) -> gtsam.GaussianFactor:
-    """Make a linear factor of GTSAM. ``keys``: the variables. ``residual`` (m,): whitened. ``blocks``: one Jacobian (m,
-    d) for each variable."""
+    """Return a linear factor of GTSAM. ``keys``: the variables. ``residual`` (m,): whitened. ``blocks``: one Jacobian
+    (m, d) for each variable."""
     unit = _unit(len(residual))
     if len(blocks) > MOST_TERMS:
         return gtsam.GaussianConditional(list(zip(keys, blocks, strict=True)), 1, -residual, unit)
@@ -206,36 +207,39 @@ def _unit(size: int) -> gtsam.noiseModel.Unit:
 
 
 class PriorFactor:
-    """A Gaussian prior of a pose. ``mean`` (3,): a pose. ``covariance`` (3, 3): its covariance in the body frame."""
+    """A Gaussian prior of a pose. ``mean`` (3,): the expected pose. ``covariance`` (3, 3): its body-frame covariance.
+    The methods take ``values``, a list of one pose (3,)."""
 
     def __init__(self, mean: Array, covariance: Array) -> None:
         self._mean = mean
         self._whitener = positive.whitener(covariance)
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Return the residual (3,) ``log(mean^-1 * pose)`` and its Jacobian (3, 3), both whitened."""
+        """Return the residual (3,) ``log(mean^-1 * pose)`` and a list of one Jacobian (3, 3), both whitened."""
         error = se2.log(se2.between(self._mean, values[0]))
         return self._whitener @ error, [self._whitener @ se2.inverse_right_jacobian(error)]
 
     def cost(self, values: Sequence[Array]) -> float:
-        """Half the squared whitened residual."""
+        """Return half the squared norm of the whitened residual at the pose."""
         error = self._whitener @ se2.log(se2.between(self._mean, values[0]))
         return 0.5 * float(error @ error)
 
 
 class VectorPriorFactor:
-    """A Gaussian prior of a vector. ``mean`` (P,). ``uncertainty``: standard deviations (P,), or a covariance (P, P)."""
+    """A Gaussian prior of a vector. ``mean`` (P,): the expected value. ``uncertainty``: standard deviations (P,), or a
+    covariance (P, P). The methods take ``values``, a list of one vector (P,)."""
 
     def __init__(self, mean: Array, uncertainty: Array) -> None:
         self._mean = mean
         self._whitener = np.diag(1.0 / uncertainty) if uncertainty.ndim == 1 else positive.whitener(uncertainty)
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Return the whitened residual (P,) and its Jacobian (P, P)."""
+        """Return the whitened residual (P,) and a list of one Jacobian (P, P). ``values``: a list of the vector
+        (P,)."""
         return self._whitener @ (values[0] - self._mean), [self._whitener]
 
     def cost(self, values: Sequence[Array]) -> float:
-        """Half the squared whitened residual."""
+        """Return half the squared norm of the whitened residual at the vector."""
         return 0.5 * float(np.sum((self._whitener @ (values[0] - self._mean)) ** 2))
 
 
@@ -271,7 +275,8 @@ def _zeros(size: int) -> Array:
 
 
 def retract(key: int, value: Array, step: Array) -> Array:
-    """Return ``value`` moved by ``step``, which is a twist in the body frame if ``key`` is the key of a pose."""
+    """Return ``value`` after a ``step``. If ``key`` is the key of a pose, the step is a twist in the body frame.
+    Otherwise it is added."""
     return se2.moved(value, step) if is_pose(key) else value + step
 
 
@@ -279,7 +284,8 @@ def frame_motions(values: Values) -> tuple[Array, list[int]]:
     """Return how all variables change when the whole solution moves in the world frame (the gauge freedom).
 
     The first result (n, 3) stacks the changes of all variables, in the tangent space of each. Its columns belong to a
-    shift in x, a shift in y, and a rotation about the origin. The second result has the end row of each variable.
+    shift in x, a shift in y, and a rotation about the origin. The second result has, for each variable, the index after
+    its last row.
     """
     parts = []
     for key, value in values.items():
@@ -303,14 +309,14 @@ def to_gtsam(values: Values) -> gtsam.Values:
 
 
 def read(solver: gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother, key: int) -> Array:
-    """The solver's estimate of the variable ``key``: a pose (3,) or a vector (P,)."""
+    """Return the solver's estimate of the variable ``key``: a pose (3,) or a vector (P,)."""
     if is_pose(key):
         return pose_array(solver.calculateEstimatePose2(key))
     return np.asarray(solver.calculateEstimateVector(key), dtype=float)
 
 
 def gather(values: Values, keys: Sequence[int]) -> list[Array]:
-    """The values of the variables with these keys, as a list in the order of the keys."""
+    """Return the values of the variables with these ``keys``, as a list in the order of the keys."""
     return [values[key] for key in keys]
 
 

@@ -21,8 +21,8 @@ State = TypeVar("State")
 
 
 class Minima(NamedTuple):
-    """The solutions of N minimisations: the final ``states`` (N, S), and the ``costs`` (N,), ``gradients`` (N, D) and
-    ``curvatures`` (N, D, D) at these states."""
+    """The results of N minimisations: the final ``states`` (N, S), and the ``costs`` (N,), ``gradients`` (N, D) and
+    ``curvatures`` (N, D, D) at these states. N is the number of independent costs."""
 
     states: Array
     costs: Array

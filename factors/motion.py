@@ -17,7 +17,8 @@ class Increment:
     """The relative motion of the robot between two times.
 
     ``delta`` (3,): the pose at the end in the frame of the pose at the start. ``covariance`` (3, 3): the covariance of
-    ``delta`` in the frame of the end. ``duration`` [s]: end minus start. ``still`` [s]: the time at rest.
+    ``delta`` in the frame of the end. ``duration`` [s]: end minus start. ``still`` [s]: the part of the duration at
+    rest.
     """
 
     delta: Array
@@ -27,7 +28,7 @@ class Increment:
 
     @property
     def moving(self) -> float:
-        """The time [s] in motion."""
+        """The part of the duration [s] during which the robot moved."""
         return self.duration - self.still
 
 
@@ -50,7 +51,8 @@ class ChainState(NamedTuple):
 
 
 def propagate(covariance: Array, increment: Increment) -> Array:
-    """Return the body-frame covariance (3, 3) of a pose after a motion, from the ``covariance`` (3, 3) before it."""
+    """Return the body-frame covariance (3, 3) of a pose after the motion ``increment``. ``covariance`` (3, 3): before
+    the motion."""
     return np.asarray(carried(covariance, increment.delta, increment.covariance))
 
 
@@ -70,12 +72,12 @@ def poses_between(
     """Interpolate M estimated poses to T times with the odometry. Returns poses (T, 3), and covariances (T, 3, 3) in
     the body frame.
 
-    ``previous`` (T,): the index of the last estimated pose before each time.
+    ``previous`` (T,): the index of the last estimated pose before each of the T times.
     ``deltas`` (T, 3), ``noises`` (T, 3, 3), ``durations`` (T,) [s]: the odometry's motion from that pose to the time,
     its body-frame covariance, and its duration.
     ``steps`` (M-1, 3), ``step_noises`` (M-1, 3, 3), ``step_durations`` (M-1,) [s]: the same from each estimated pose to
-    the next one.
-    ``elsewhere`` (M-1,): True if a person carried the robot to the next pose, which is then not used before its time.
+    the next estimated pose.
+    ``elsewhere`` (M-1,): True if a person carried the robot to the next pose. Times before that pose then ignore it.
     ``poses`` (M, 3), ``covariances`` (M, 3, 3): the estimated poses and their body-frame covariances.
 
     The error of the odometry between two estimated poses is distributed in proportion to time.

@@ -31,20 +31,22 @@ NOT_MOVED, NO_SPREAD, EXACT = np.zeros(3), np.zeros((3, 3)), np.empty((0, 3, 3))
 
 @dataclass(frozen=True, slots=True)
 class ReprojectionFactor:
-    """A factor on the robot's pose from K known points in one image. The pose may be the pose at a slightly earlier time.
+    """A factor on the robot's pose from K known points in one image. The pose may be the pose at a slightly earlier
+    time.
 
-    ``points`` (K, 3): world positions. ``pixels`` (K, 2): their measured pixels.
+    ``model``: the camera. ``points`` (K, 3) [m]: world positions. ``pixels`` (K, 2): their measured pixels.
     ``offset`` (3,): the robot's pose at the time of the image in the frame of the estimated pose, from odometry. None
     if the two poses are equal. ``offset_covariance`` (3, 3): its body-frame covariance, which is added to the noise.
-    ``point_covariances`` (K, 3, 3): covariances of the points of an inexact map. They are added to the noise.
+    ``point_covariances`` (K, 3, 3): covariances of the points, which are added to the noise. None if the points are
+    exact.
     ``estimated``: indices in :data:`PARAMETERS` of the P camera constants that are estimated.
-    ``moved_by`` (K,): for each point, the index of the displacement that is added to the point, or -1. Empty if there
-    are no displacements.
-    ``twist`` (3,): the robot's body-frame velocity at the time of the image. Required if the time offset is estimated.
+    ``moved_by`` (K,): for each point, the index of the estimated displacement that is added to the point, or -1. Empty
+    if no displacement is estimated. ``twist`` (3,): the robot's body-frame velocity at the time of the image. Required
+    if the time offset is estimated.
 
-    The methods take a list of values in this order: the pose (3,), the corrections (P,) of the estimated constants if P
-    > 0, and the displacements (3,) in the world. The robot's roll and pitch are an unknown error that all points have
-    in common.
+    The methods take ``values``, a list in this order: the pose (3,), the corrections (P,) of the estimated constants if
+    P > 0, and each displacement (3,) [m] in the world. The robot's roll and pitch are unknown errors that all points
+    have in common.
     """
 
     model: CameraModel
@@ -63,7 +65,7 @@ class ReprojectionFactor:
         return not self.estimated and not self.moved_by
 
     def packed(self) -> pixel_kernels.PackedImage:
-        """The fields of the factor as a tuple, for compiled code. The factor must depend on the pose only."""
+        """Return the fields of the factor as a tuple, for compiled code. The factor must depend on the pose only."""
         model, offset, noise, covariances = self.model, self.offset, self.offset_covariance, self.point_covariances
         return pixel_kernels.PackedImage(
             lens_of(model),
@@ -81,8 +83,10 @@ class ReprojectionFactor:
         )
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """The whitened residual (2K,) and its Jacobian (2K, d) by each value, with robust weights and tempering. The
-        variances of roll and pitch are part of the noise."""
+        """Return the whitened residual (2K,) of K pixels and a list of its Jacobians (2K, d), one for each variable of
+        size d.
+        ``values``: the variables, as in the class docstring. Residual and Jacobians include robust weights and
+        tempering. Their noise includes the variances of the robot's roll and pitch."""
         if self.of_pose_alone:
             residual, jacobian = pixel_kernels.linearized(self.packed(), np.ascontiguousarray(values[0], dtype=float))
             return residual, [jacobian]
@@ -93,28 +97,33 @@ class ReprojectionFactor:
         return residual, np.split(jacobian, ends[:-1], axis=1)
 
     def cost(self, values: Sequence[Array]) -> float:
-        """Return the robust loss for the best-fitting roll and pitch, multiplied by the tempering exponent."""
+        """Return the robust loss for the best-fitting roll and pitch, multiplied by the tempering exponent. ``values``:
+        the variables, as in the class docstring."""
         error, tilt = self.levelled(values)
         loss = np.sum(huber_loss(np.sum(error**2, axis=-1), self.model.robust)) + 0.5 * tilt @ tilt
         return self.model.tempering * float(loss)
 
     def levelled(self, values: Sequence[Array]) -> tuple[Array, Array]:
-        """Fit the robot's roll and pitch to the image. Returns the whitened residual (K, 2) after the fit, and roll and
-        pitch (2,) in standard deviations."""
+        """Fit the robot's roll and pitch to the K pixels of the image. ``values``: the variables, as in the class
+        docstring.
+        Returns the whitened residual (K, 2) after the fit, and roll and pitch (2,) in units of their prior standard
+        deviation."""
         error, (*_, by_tilt) = self.whitened(values)
         roll, pitch, _ = pixel_kernels.tilted(error, np.ascontiguousarray(by_tilt), float(self.model.robust))
         tilt = np.array((roll, pitch))
         return error + by_tilt @ tilt, tilt
 
     def weight(self, squared: Array) -> Array:
-        """The robust weights of ``squared`` norms of whitened residuals, multiplied by the tempering exponent."""
+        """Return the robust weights (K,) for ``squared`` (K,), the squared norms of whitened residuals, multiplied by
+        the tempering exponent."""
         return self.model.tempering * huber_weight(squared, self.model.robust)
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Return the whitened residual (K, 2) of a level robot, predicted minus measured, and a list of Jacobians.
 
-        The list has the Jacobian (K, 2, d) by each value, and as last element the Jacobian (K, 2, 2) by roll and pitch
-        in standard deviations. Robust weights are not included.
+        ``values``: the variables, as in the class docstring. The list has the Jacobian (K, 2, d) by each variable of
+        size d. Its last element is the Jacobian (K, 2, 2) by roll and pitch in units of their prior standard deviation.
+        Robust weights are not included.
         """
         moved_by, displacements = np.array(self.moved_by, dtype=np.int64), values[1 + bool(self.estimated) :]
         moves = None if not self.moved_by else np.array((*displacements, np.zeros(3)))[moved_by]
@@ -134,10 +143,10 @@ class ReprojectionFactor:
         return residual, [*blocks, jacobian[..., TILT:POINT]]
 
     def fixed(self, parameters: Sequence[Array], displacement: Array | None) -> ReprojectionFactor:
-        """Return a factor on the pose only. The constants and displacements are fixed.
+        """Return a factor on the pose only, with constants and displacements fixed at the given values.
 
         ``parameters``: a sequence of one array (P,), the corrections of the estimated constants, or an empty sequence.
-        ``displacement`` (K, 3): is added to the points. None for zero.
+        ``displacement`` (K, 3) [m]: is added to the points. None for zero.
         """
         if not parameters and displacement is None:
             return self
@@ -151,7 +160,7 @@ class ReprojectionFactor:
         return replace(self, model=model, points=points, offset=offset, estimated=(), moved_by=())
 
     def dof(self) -> int:
-        """Number of measured pixel coordinates."""
+        """Return the number of measured pixel coordinates, two per point."""
         return 2 * len(self.pixels)
 
 
@@ -164,15 +173,16 @@ def image_update(
     values: Sequence[Array] = (),
     columns: Sequence[slice] = (),
 ) -> Correction:
-    """Correct a Gaussian by known points in an image, with a Kalman update. See :func:`~factors.update.update_state`.
+    """Correct the Gaussian estimate of a robot pose by known points in an image, with an iterated Kalman update.
 
     ``pose`` (3,): the predicted pose.
     ``covariance`` (S, S): covariance of the error state. Its first three components are the pose's body-frame
-    perturbation. ``iterations``, ``converged``: limits of the iterations.
+    perturbation. ``iterations``: the maximum number of iterations. They end earlier when a step is below ``converged``.
     ``values``: the predicted values of the factor's variables except the pose. ``columns``: for each of these
-    variables, its components in the error state.
+    variables, the slice of its components in the error state.
 
-    With ``values``, the resulting covariance is in the body frame of the updated pose instead of the predicted pose.
+    Returns the correction of the error state, the new covariance and statistics. With ``values``, the new covariance is
+    in the body frame of the updated pose instead of the predicted pose. See :func:`~factors.update.update_state`.
     """
     size = len(covariance)
     packed = factor.packed() if factor.of_pose_alone else None
@@ -199,8 +209,9 @@ def image_update(
 
 
 def turns(estimated: tuple[int, ...], changes: Array) -> Array:
-    """The left Jacobian (3, 3) of SO(3) at the corrected rotation vector of the camera about the robot's axes.
-    ``changes`` (P,): corrections of the constants with indices ``estimated`` in :data:`PARAMETERS`."""
+    """Return the Jacobian (3, 3) that converts a change of the camera's estimated rotation vector to a small rotation.
+    Both are about the robot's axes. ``changes`` (P,): the corrections of the constants with indices ``estimated`` in
+    :data:`PARAMETERS`, which include roll, pitch and yaw. It is the left Jacobian of SO(3)."""
     full = np.zeros(len(PARAMETERS))
     full[list(estimated)] = changes
     return np.asarray(gtsam.Rot3.ExpmapDerivative(-full[3:6]))

@@ -22,8 +22,8 @@ LINEAR = 0.1  # below this index of :func:`linearity`, x, y, z of a point are ne
 
 
 def directions(rays: Array) -> tuple[Array, Array]:
-    """Return the directions of rays as unit vectors (K, 3) in the world, and their Jacobian (K, 3, 2) by azimuth and
-    elevation. ``rays`` (K, 6): x, y, z of the start, azimuth, elevation, and the inverse depth of a point."""
+    """Return the directions of K rays as unit vectors (K, 3) in the world, and their Jacobian (K, 3, 2) by azimuth and
+    elevation. ``rays`` (K, 6): x, y, z of the start, azimuth, elevation, and inverse depth."""
     azimuth, elevation = rays[:, 3], rays[:, 4]
     ca, sa, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
     by_angles = np.zeros((len(rays), 3, 2))
@@ -33,8 +33,8 @@ def directions(rays: Array) -> tuple[Array, Array]:
 
 
 def turned(angles: Array) -> Array:
-    """The derivative (2, 3) of azimuth and elevation by a small rotation vector about the world's axes. ``angles``
-    (2,): azimuth and elevation [rad]."""
+    """Return the derivative (2, 3) of azimuth and elevation by a small rotation vector about the world's axes.
+    ``angles`` (2,): azimuth and elevation [rad]."""
     azimuth, elevation = angles.tolist()
     c, s = np.cos(azimuth), np.sin(azimuth)
     slope = np.tan(elevation)

@@ -26,10 +26,11 @@ Place = tuple[tuple[float, ...], ...]  # a camera's pose in the robot frame: pos
 
 @compiled
 def _radial(k: Lens, rr: float) -> tuple[float, float]:
-    """The radial factor of a rational or fisheye lens, and twice its derivative by ``rr``.
+    """Return the radial factor of a rational or fisheye lens ``k``, and twice its derivative by ``rr``.
 
-    ``rr``: the squared distance x^2 + y^2 of the direction from the axis. The distorted distance is the distance times the radial
-    factor. Fisheye lens: Kannala and Brandt, "A generic camera model and calibration method", PAMI 28(8), 2006, eq. 6.
+    ``rr``: the squared distance x^2 + y^2 of the direction from the axis. The distorted distance is the distance times
+    the radial factor. Fisheye lens: Kannala and Brandt, "A generic camera model and calibration method", PAMI 28(8),
+    2006, eq. 6.
     """
     k1, k2, k3, k4, k5, k6 = k[4], k[5], k[-4], k[-3], k[-2], k[-1]
     if k[-5] == RATIONAL:
@@ -48,8 +49,8 @@ def _radial(k: Lens, rr: float) -> tuple[float, float]:
 
 @compiled
 def radial_slope(k: Lens, rr: float) -> float:
-    """The derivative of the distorted distance from the axis by the undistorted distance, of a rational or fisheye lens
-    ``k``. ``rr``: the squared undistorted distance."""
+    """Return the derivative of the distorted distance from the optical axis by the undistorted distance. ``k``: a
+    rational or fisheye lens. ``rr``: the squared undistorted distance x^2 + y^2 at depth 1."""
     radial, slope = _radial(k, rr)
     return float(radial + rr * slope)
 
@@ -92,8 +93,8 @@ def _distorted(k: Lens, x: float, y: float) -> tuple[float, float, float, float,
 def pixel(
     k: Lens, p0: float, p1: float, p2: float
 ) -> tuple[float, float, tuple[float, float, float], tuple[float, float, float]]:
-    """Project the point (p0, p1, p2) in the camera frame by the lens ``k``. Returns u and v of the pixel, and the
-    gradients of u and of v by the point."""
+    """Project the point (p0, p1, p2) in the camera frame by the lens ``k``. Returns the pixel coordinates u and v, and
+    the gradients of u and of v by the point (3 numbers each)."""
     near = 1.0 / max(p2, NEAREST)
     x, y = p0 * near, p1 * near
     xd, yd, xx, xy, yx, yy = _distorted(k, x, y)
@@ -105,7 +106,8 @@ def pixel(
 
 @compiled(inline="always")
 def mounting(position: Array, rotation: Array) -> Place:
-    """The camera's ``position`` (3,) and ``rotation`` (3, 3) in the robot frame as tuples of numbers, for fast access."""
+    """Return the camera's ``position`` (3,) and ``rotation`` (3, 3) in the robot frame as tuples of numbers, for fast
+    access in compiled code."""
     p, r = position, rotation
     right, down, ahead = (r[0, 0], r[1, 0], r[2, 0]), (r[0, 1], r[1, 1], r[2, 1]), (r[0, 2], r[1, 2], r[2, 2])
     return (p[0], p[1], p[2]), right, down, ahead
@@ -134,9 +136,9 @@ def in_camera(
 def undistorted(k: Lens, distorted: Array) -> tuple[Array, Array]:
     """Invert the distortion of the lens ``k`` by Newton's method.
 
-    ``distorted`` (K, 2): distorted directions. Returns the undistorted directions (K, 2), and errors (K,): the distance
-    from each distorted direction to the distorted result. Results have a positive determinant of the lens's Jacobian.
-    If ``distorted`` is NaN, the result is NaN with an infinite error.
+    ``distorted`` (K, 2): distorted directions (x, y) at depth 1. Returns the undistorted directions (K, 2), and errors
+    (K,): the distance from each distorted direction to the result after distortion. At the results, the determinant of
+    the lens's Jacobian is positive. If ``distorted`` is NaN, the result is NaN with an infinite error.
     """
     n = len(distorted)
     directions, errors = np.full((n, 2), np.nan), np.full(n, np.inf)
@@ -161,7 +163,8 @@ def undistorted(k: Lens, distorted: Array) -> tuple[Array, Array]:
 
 @compiled(error_model="numpy")
 def project(k: Lens, points: Array) -> tuple[Array, Array]:
-    """The pixels (K, 2) of points (K, 3) in the camera frame, and their Jacobians (K, 2, 3) by the points."""
+    """Return the pixels (K, 2) of points (K, 3) in the camera frame, and their Jacobians (K, 2, 3) by the points.
+    ``k``: the lens."""
     n = len(points)
     pixels, jacobians = np.empty((n, 2)), np.empty((n, 2, 3))
     for i in range(n):
@@ -174,7 +177,10 @@ def project(k: Lens, points: Array) -> tuple[Array, Array]:
 
 @compiled(error_model="numpy")
 def linearize_in_space(k: Lens, position: Array, rotation: Array, points: Array) -> tuple[Array, Array, Array]:
-    """The compiled part of :func:`factors.camera.model.linearize_in_space`, with the same results."""
+    """Project world ``points`` (K, 3) to the pixels of a camera at ``position`` (3,) with ``rotation`` (3, 3) in the
+    world.
+    ``k``: the lens. Returns the pixels (K, 2) and their Jacobians by the camera's perturbation (K, 2, 6) and by the
+    points (K, 2, 3). The perturbation is in the camera frame, with rotation before translation."""
     n = len(points)
     pixels, by_camera, by_point = np.empty((n, 2)), np.empty((n, 2, 6)), np.empty((n, 2, 3))
     for i in range(n):
@@ -198,11 +204,11 @@ def linearize_in_space(k: Lens, position: Array, rotation: Array, points: Array)
 def project_planar(
     camera: tuple[Lens, Array, Array], pose: Array, tilt: Array, turn: Array, point: Array, jacobian: Array
 ) -> tuple[float, float, float]:
-    """Project a world ``point`` (3,) from a robot on a plane.
+    """Project a world ``point`` (3,) to the camera of a robot on a plane.
 
     ``camera``: the lens, and the camera's position (3,) and rotation (3, 3) in the robot frame.
-    ``pose`` (3,), ``tilt`` (2,) [rad]: the robot's planar pose, and its roll and pitch. ``turn`` (3, 3): :func:`turned`
-    of the tilt.
+    ``pose`` (3,), ``tilt`` (2,) [rad]: the robot's planar pose, and its roll and pitch. ``turn`` (3, 3): the rotation
+    matrix of the tilt, from :func:`turned`.
     ``jacobian`` (2, WIDTH): output, the derivatives of the pixel by pose, tilt, point and the camera's constants.
 
     Returns the pixel coordinates u and v, and the depth [m].
@@ -259,7 +265,8 @@ def linearize(camera: tuple[Lens, Array, Array], pose: Array, points: Array) -> 
 
 @compiled(error_model="numpy")
 def turned(roll: float, pitch: float) -> Array:
-    """The rotation (3, 3) of a tilted robot: the exponential of the rotation vector (roll, pitch, 0) [rad]."""
+    """Return the rotation matrix (3, 3) of a robot with roll and pitch, the exponential of the rotation vector (roll,
+    pitch, 0) [rad]."""
     angle = math.sqrt(roll * roll + pitch * pitch)
     a, b = (math.sin(angle) / angle, (1.0 - math.cos(angle)) / (angle * angle)) if angle > 1e-6 else (1.0, 0.5)
     turn = np.empty((3, 3))
@@ -281,15 +288,16 @@ def whiten(
     sigma: float,
     robust: float,
 ) -> tuple[Array, Array, Array]:
-    """Linearise N pixel measurements.
+    """Linearise the reprojection errors of N measured pixels.
 
     ``k``, ``position``, ``rotation``: the lens, and the camera's pose in the robot frame.
-    ``poses`` (N, 3), ``tilts`` (N, 2), ``points`` (N, 3): the robot's pose and tilt, and the world point of each
-    measurement. ``measured`` (N, 2): the measured pixels. ``sigma`` [px]: the standard deviation of each coordinate.
+    ``poses`` (N, 3), ``tilts`` (N, 2) [rad], ``points`` (N, 3): the robot's pose, its roll and pitch, and the world
+    point of each measurement. ``measured`` (N, 2): the measured pixels. ``sigma`` [px]: the standard deviation of each
+    coordinate.
     ``robust``: the scale of Huber's loss in standard deviations.
 
     Returns whitened residuals (N, 2) with robust weights, their Jacobian (N, 2, WIDTH), and the squared norms (N,) of
-    the residuals without robust weights.
+    the residuals without robust weights. The Jacobian's columns are pose, tilt, point and camera constants.
     """
     n = len(measured)
     residual, jacobian, squared = np.empty((n, 2)), np.empty((n, 2, WIDTH)), np.zeros(n)
@@ -308,9 +316,10 @@ def linearize_one(
     residual: Array,
     jacobian: Array,
 ) -> float:
-    """Linearise one pixel measurement, as :func:`whiten` does for many. ``camera``: lens, position and rotation.
+    """Linearise the reprojection error of one pixel, as :func:`whiten` does for many. ``camera``: lens, position and
+    rotation.
     ``at``: pose, tilt, point and measured pixel. Writes the whitened ``residual`` (2,) and ``jacobian`` (2, WIDTH).
-    Returns the squared residual without robust weight."""
+    Returns the squared norm of the residual without robust weight."""
     pose, tilt, point, measured = at
     u, v, depth = project_planar(camera, pose, tilt, turned(tilt[0], tilt[1]), point, jacobian)
     residual[0], residual[1] = (u - measured[0]) / sigma, (v - measured[1]) / sigma
@@ -340,11 +349,12 @@ def log_likelihood(
     scale: float,
     tempering: float,
 ) -> Array:
-    """The compiled part of :func:`factors.camera.model.log_likelihood`.
+    """Return the robust, tempered log-likelihood (N,) of one image at N robot poses (N, 3), up to a constant.
 
-    ``whiteners`` (K, 2, 2): the matrices that whiten the pixel errors. ``tilts`` (K, 2, 2): the Jacobian of the
-    whitened errors by roll and pitch in standard deviations. ``scale``: the scale of Huber's loss. The tilt of each
-    pose is fitted by least squares, without robust weights.
+    ``points`` (K, 3): world points. ``pixels`` (K, 2): their measured pixels. ``whiteners`` (K, 2, 2): the matrices
+    that whiten the pixel errors. ``tilts`` (K, 2, 2): the Jacobian of the whitened errors by roll and pitch in standard
+    deviations. ``scale``: the scale of Huber's loss. ``tempering``: the exponent. The tilt of each pose is fitted by
+    least squares, without robust weights.
     """
     place, count = mounting(position, rotation), len(points)
     px, py, c, s = poses[:, 0].copy(), poses[:, 1].copy(), np.cos(poses[:, 2]), np.sin(poses[:, 2])

@@ -44,7 +44,7 @@ FORWARD: Array = np.array(((0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)))
 
 @dataclass(frozen=True, slots=True)
 class CameraModel:
-    """A camera and its noise.
+    """A camera, its pose on the robot, and its noise.
 
     ``fx``, ``fy``, ``cx``, ``cy`` [px]: focal lengths and principal point.
     ``width``, ``height`` [px]: size of the images.
@@ -54,7 +54,7 @@ class CameraModel:
     ``robust``: scale of Huber's loss in standard deviations.
     ``tempering``: exponent of the likelihood, below 1 if errors are correlated between images.
     ``tilt`` [rad]: standard deviation of the robot's roll and pitch, because floors are not exactly level. All points
-    of an image have this error in common.
+    of an image have the same roll and pitch.
     ``fisheye``: True for a fisheye lens.
     """
 
@@ -74,7 +74,8 @@ class CameraModel:
     fisheye: bool = False
 
     def intrinsics(self) -> Array:
-        """The focal lengths, principal point and distortion as an array. A last element 1 marks a fisheye lens."""
+        """The focal lengths, principal point and distortion as one array, in this order. A fisheye lens has 1 as an
+        additional last element."""
         return np.array((self.fx, self.fy, self.cx, self.cy, *self.distortion, *((1.0,) if self.fisheye else ())))
 
     def matrix(self) -> Array:
@@ -91,30 +92,32 @@ class CameraModel:
         return gtsam.Cal3DS2(self.fx, self.fy, 0.0, self.cx, self.cy, *self.distortion)
 
     def contains(self, pixels: Array, margin: float = 0.0) -> Any:
-        """A mask (...) of the ``pixels`` (..., 2) that are in the image, or at most ``margin`` pixels outside of it."""
+        """Return a mask (...) of the ``pixels`` (..., 2) that are in the image, or at most ``margin`` pixels outside of
+        it."""
         u, v = pixels[..., 0], pixels[..., 1]
         inside = (u >= -0.5 - margin) & (u <= self.width - 0.5 + margin)
         return inside & (v >= -0.5 - margin) & (v <= self.height - 0.5 + margin)
 
 
 def mounting(roll: float, pitch: float, yaw: float) -> Array:
-    """The rotation (3, 3) of a camera in the robot frame from three angles [rad].
+    """Return the rotation (3, 3) of a camera in the robot frame from three angles [rad].
 
     A forward-facing camera is rotated by ``roll`` about x, by ``pitch`` about y (positive is down), and by ``yaw``
-    about z (positive is left), in this order, about the axes of the robot.
+    about z (positive is left), in this order, about the fixed axes of the robot.
     """
     return np.asarray(gtsam.Rot3.RzRyRx(roll, pitch, yaw).matrix() @ FORWARD)
 
 
 def angles_of_camera(rotation: Array) -> tuple[float, float, float]:
-    """The roll, pitch and yaw [rad] of a camera with ``rotation`` (3, 3) in the robot frame. The inverse of :func:`mounting`."""
+    """Return the roll, pitch and yaw [rad] of a camera with ``rotation`` (3, 3) in the robot frame. The inverse of
+    :func:`mounting`."""
     roll, pitch, yaw = gtsam.Rot3(rotation @ FORWARD.T).xyz().tolist()
     return roll, pitch, yaw
 
 
 def recalibrated(model: CameraModel, changes: Array) -> CameraModel:
-    """The model with corrected constants. ``changes`` (8,): corrections of :data:`PARAMETERS`. The time offset is
-    ignored, because it is not part of the model."""
+    """Return the model with corrected constants. ``changes`` (8,): corrections of :data:`PARAMETERS`. The time offset
+    is ignored, because it is not part of the model."""
     turn = np.asarray(gtsam.Rot3.Expmap(changes[3:6]).matrix())
     scale = math.exp(float(changes[FOCAL]))
     return replace(
@@ -127,7 +130,7 @@ def recalibrated(model: CameraModel, changes: Array) -> CameraModel:
 
 
 def project(model: CameraModel, points: Array) -> Array:
-    """The pixels (K, 2) of ``points`` (K, 3), which are given in the camera frame."""
+    """Return the pixels (K, 2) of ``points`` (K, 3), which are given in the camera frame."""
     return np.asarray(reprojection_kernels.project(lens_of(model), np.ascontiguousarray(points, dtype=float))[0])
 
 
@@ -140,13 +143,14 @@ def in_camera(model: CameraModel, pose: Array, points: Array) -> Array:
 
 
 def mounted(model: CameraModel, position: Array, rotation: Array) -> tuple[Array, Array]:
-    """The camera's position (3,) and rotation (3, 3) in the world, from the robot's ``position`` (3,) and ``rotation`` (3, 3)."""
+    """Return the camera's position (3,) and rotation (3, 3) in the world, from the robot's ``position`` (3,) and
+    ``rotation`` (3, 3)."""
     return position + rotation @ model.position, rotation @ model.rotation
 
 
 def lift(model: CameraModel) -> Array:
-    """The Jacobian (6, 6) of the camera's perturbation by the robot's perturbation. Each perturbation is in the body's
-    own frame, with rotation before translation."""
+    """Return the Jacobian (6, 6) of the camera's perturbation by the robot's perturbation. Each perturbation is in the
+    body's own frame, with rotation before translation."""
     x, y, z = model.position
     jacobian = np.zeros((6, 6))
     jacobian[:3, :3] = jacobian[3:, 3:] = model.rotation.T
@@ -155,16 +159,17 @@ def lift(model: CameraModel) -> Array:
 
 
 def carrier(model: CameraModel, position: Array, rotation: Array) -> tuple[Array, Array]:
-    """The robot's position (3,) and rotation (3, 3) in the world, from the camera's ``position`` (3,) and ``rotation``
-    (3, 3). The inverse of :func:`mounted`."""
+    """Return the robot's position (3,) and rotation (3, 3) in the world, from the camera's ``position`` (3,) and
+    ``rotation`` (3, 3) in the world. The inverse of :func:`mounted`."""
     turn = rotation @ model.rotation.T
     return position - turn @ model.position, turn
 
 
 def camera_pose(model: CameraModel, pose: Array, tilt: Array | None = None) -> tuple[Array, Array]:
-    """The camera's position (3,) and rotation (3, 3) in the world, from the robot's planar ``pose`` (3,).
+    """Return the camera's position (3,) and rotation (3, 3) in the world, from the robot's planar ``pose`` (3,).
 
-    ``tilt`` (2,) [rad]: roll and pitch of the robot, a rotation vector along its own x and y axes. None for a level robot.
+    ``tilt`` (2,) [rad]: roll and pitch of the robot, a rotation vector along its own x and y axes. None for a level
+    robot.
     """
     c, s = math.cos(pose[2]), math.sin(pose[2])
     turn = np.array(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))
@@ -174,26 +179,27 @@ def camera_pose(model: CameraModel, pose: Array, tilt: Array | None = None) -> t
 
 
 def predict(model: CameraModel, pose: Array, points: Array) -> tuple[Array, Array]:
-    """Predict the pixels (K, 2) of world ``points`` (K, 3) from the robot's ``pose`` (3,). Also returns the depths (K,)
-    [m], which are negative behind the camera."""
+    """Predict the pixels (K, 2) of world ``points`` (K, 3) from the robot's planar ``pose`` (3,). Also returns the
+    depths (K,) [m], which are negative behind the camera."""
     local = in_camera(model, pose, points)
     return project(model, local), local[:, 2]
 
 
 def undistorted(model: CameraModel, pixels: Array) -> Array:
-    """The directions (K, 2) of ``pixels`` (K, 2), as (x, y) at depth 1 in the camera frame. The inverse of
+    """Return the directions (K, 2) of ``pixels`` (K, 2), as (x, y) at depth 1 in the camera frame. The inverse of
     :func:`project`, computed by Newton's method."""
     distorted = (np.asarray(pixels, dtype=float) - (model.cx, model.cy)) / (model.fx, model.fy)
     return np.asarray(reprojection_kernels.undistorted(lens_of(model), np.ascontiguousarray(distorted))[0])
 
 
 def rays(model: CameraModel, pixels: Array) -> Array:
-    """The viewing rays of ``pixels`` (K, 2), as points (K, 3) at depth 1 in the camera frame."""
+    """Return the viewing rays of ``pixels`` (K, 2), as points (K, 3) at depth 1 in the camera frame."""
     return np.column_stack((undistorted(model, pixels), np.ones(len(pixels))))
 
 
 def folded(model: CameraModel) -> Array | None:
-    """Return a pixel (2,) of a grid over the image at which the lens model is not invertible, or None.
+    """Return one pixel (2,) at which the lens model is not invertible, or None if no pixel of a grid over the image is
+    such.
 
     A lens is invertible at a pixel if a direction within the valid radius projects to the pixel, with a positive
     determinant of the lens's Jacobian.
@@ -252,12 +258,13 @@ def log_likelihood(
     tilts: Array,
     covariances: Array | None = None,
 ) -> Array:
-    """The robust, tempered log-likelihood (N,), up to a constant, of one image at N poses. Each pose has the roll and
-    pitch that fit best.
+    """Return the robust, tempered log-likelihood (N,), up to a constant, of one image at N robot poses. Each pose is
+    evaluated with the roll and pitch that fit best.
 
     ``poses`` (N, 3): robot poses. ``points`` (K, 3): world points. ``pixels`` (K, 2): their measured pixels.
     ``tilts`` (K, 2, 2): the Jacobian of the pixels by roll and pitch, from :func:`by_tilt`.
-    ``covariances`` (K, 2, 2) [px^2]: covariance of each pixel, including the error of an inexact map. None means pixel noise only.
+    ``covariances`` (K, 2, 2) [px^2]: covariance of each pixel, including the error of an inexact map. None means pixel
+    noise only.
     """
     if covariances is None:
         whiteners = np.broadcast_to(np.eye(2) / model.sigma, (len(points), 2, 2)).copy()
@@ -303,8 +310,8 @@ class TiltScale:
     """A Bayesian filter that estimates the standard deviation of the robot's roll and pitch from images.
 
     ``sigma``: the estimated standard deviation [rad].
-    ``guess`` (15,): the log prior of each value in :data:`SCALES`.
-    ``log_evidence`` (15,): the log-likelihood of the images for each value.
+    ``guess`` (15,): the log prior of each of the 15 possible standard deviations :data:`SCALES`.
+    ``log_evidence`` (15,): the log-likelihood of all images so far for each standard deviation.
     """
 
     sigma: float
@@ -313,7 +320,7 @@ class TiltScale:
 
     @staticmethod
     def guessed(sigma: float) -> TiltScale:
-        """A filter without images, with a rough initial guess ``sigma`` [rad] of the standard deviation."""
+        """Return a filter without images, with a rough initial guess ``sigma`` [rad] of the standard deviation."""
         return TiltScale(sigma, -0.5 * (np.log(SCALES / sigma) / VAGUE) ** 2, np.zeros(len(SCALES)))
 
     def learnt(self, tilt: Array, covariance: Array, prior: float) -> tuple[TiltScale, float]:
@@ -331,8 +338,9 @@ class TiltScale:
 
 @compiled(error_model="numpy")
 def _learnt(tilt: Array, covariance: Array, prior: float, prior_log: Array, log_evidence: Array) -> tuple[float, float]:
-    """Compute :meth:`TiltScale.learnt`. Updates ``log_evidence`` in place. Returns the expected standard deviations of
-    later images and of this image."""
+    """Compute :meth:`TiltScale.learnt`. ``prior_log`` (15,): the log prior of each standard deviation. Updates
+    ``log_evidence`` (15,) in place. Returns the expected standard deviations [rad] of the tilt in later images and in
+    this image."""
     determinant = covariance[0, 0] * covariance[1, 1] - covariance[0, 1] ** 2
     a, b, d = covariance[1, 1] / determinant, -covariance[0, 1] / determinant, covariance[0, 0] / determinant
     x, y = a * tilt[0] + b * tilt[1], b * tilt[0] + d * tilt[1]
@@ -352,7 +360,7 @@ def _learnt(tilt: Array, covariance: Array, prior: float, prior_log: Array, log_
 
 @compiled(error_model="numpy")
 def _normalised(log: Array) -> Array:
-    """Convert log-weights to weights with the sum 1."""
+    """Return weights with the sum 1 from log-weights."""
     weights: Array = np.exp(log - log.max())
     weights /= weights.sum()
     return weights
@@ -360,7 +368,8 @@ def _normalised(log: Array) -> Array:
 
 @compiled(error_model="numpy")
 def _scale(weights: Array) -> float:
-    """The geometric mean of :data:`SCALES` with these ``weights``. An arithmetic mean would depend mostly on the largest values."""
+    """Return the geometric mean of :data:`SCALES` with these ``weights``. An arithmetic mean would depend mostly on the
+    largest values."""
     total = 0.0
     for i, scale in enumerate(SCALES):
         total += weights[i] * math.log(scale)

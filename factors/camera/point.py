@@ -38,19 +38,21 @@ class PointFactor:
 
     @property
     def alike(self) -> Hashable:
-        """A key that is equal for factors of one camera, which are linearised together."""
+        """A hashable key that is equal for factors of one camera. Such factors can be linearised together."""
         return id(self.model)
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """The whitened residual (2,) with robust weights, and its Jacobian (2, d) by each value. If the point is behind
-        the camera, the residual is constant and the Jacobian is zero."""
+        """Return the whitened residual (2,) with robust weight, and its Jacobian (2, d) by each variable of size d.
+        ``values``: the variables, as in the class docstring. If the point is behind the camera, the residual is
+        constant and the Jacobian is zero."""
         residuals, blocks = self.linearize_all([self], [values])
         return residuals[0], [block[0] for block in blocks]
 
     @staticmethod
     def linearize_all(factors: Sequence[PointFactor], values: Sequence[Sequence[Array]]) -> tuple[Array, list[Array]]:
-        """Linearise N factors of one camera, each at its own values. The camera's constants must be equal in all
-        values. Returns residuals (N, 2) and the Jacobian (N, 2, d) by each value."""
+        """Linearise N factors of one camera. ``values``: for each factor, its variables as in the class docstring. The
+        camera's constants must be equal for all. Returns residuals (N, 2) and the Jacobian (N, 2, d) by each variable
+        of size d."""
         estimated, constants = factors[0].estimated, values[0][1]
         residual, jacobian, _ = _linearize_all(factors, values)
         if TIME_OFFSET in estimated:
@@ -65,7 +67,7 @@ class PointFactor:
         return residual, blocks
 
     def cost(self, values: Sequence[Array]) -> float:
-        """The robust loss of the pixel."""
+        """Return the robust loss of the pixel. ``values``: the variables, as in the class docstring."""
         return float(huber_loss(_linearize_all([self], [values])[2], self.model.robust).sum())
 
     def is_astray(self, values: Sequence[Array]) -> bool:
@@ -96,7 +98,7 @@ def _linearize_all(factors: Sequence[PointFactor], values: Sequence[Sequence[Arr
 
 
 def _later(factors: Sequence[PointFactor], values: Sequence[Sequence[Array]]) -> tuple[Array, Array]:
-    """The robot's velocities (N, 3) at each factor, and its motions (N, 3) during the estimated time offset."""
+    """Return the robot's velocities (N, 3) at N factors, and its motions (N, 3) during the estimated time offset."""
     twists = np.array([f.twist for f in factors], dtype=float)
     seconds = float(values[0][1][factors[0].estimated.index(TIME_OFFSET)])
     return twists, se2.exp(seconds * twists)
@@ -107,7 +109,7 @@ class PointPrior:
     """A weak prior of a point's position in the robot frame, as a factor on the robot's pose and the point.
 
     ``mean`` (3,) [m]: the expected position in the robot frame. ``sigma`` [m]: the standard deviation of each
-    coordinate. The methods take a list of two values: the robot's pose (3,) and the point (3,) in the world.
+    coordinate. The methods take ``values``, a list of the robot's pose (3,) and the point (3,) in the world.
 
     A prior in the world frame would constrain the robot: a thousand priors with 30 m would fix its position to a metre.
     """
@@ -117,12 +119,12 @@ class PointPrior:
 
     @classmethod
     def of(cls, pose: Array, point: Array, sigma: float) -> PointPrior:
-        """Make the prior of a world ``point`` (3,) with the standard deviation ``sigma`` [m] relative to a robot at
+        """Return the prior of a world ``point`` (3,) with the standard deviation ``sigma`` [m] relative to a robot at
         ``pose`` (3,)."""
         return cls(_from_robot(pose, point), sigma)
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """The whitened residual (3,), and its Jacobians (3, 3) by the pose and by the point."""
+        """Return the whitened residual (3,), and a list of its Jacobians (3, 3) by the pose and by the point."""
         pose, point = values
         relative = _from_robot(pose, point)
         c, s = math.cos(pose[2]), math.sin(pose[2])
@@ -131,7 +133,8 @@ class PointPrior:
         return (relative - self.mean) / self.sigma, [by_pose / self.sigma, by_point / self.sigma]
 
     def cost(self, values: Sequence[Array]) -> float:
-        """Half the squared whitened residual."""
+        """Return half the squared norm of the whitened residual. ``values``: the robot's pose (3,) and the point
+        (3,)."""
         residual = (_from_robot(*values) - self.mean) / self.sigma
         return 0.5 * float(residual @ residual)
 

@@ -74,8 +74,9 @@ def inverse_depths(first: Array, second: Array, position: Array, motion: Array) 
     """Triangulate K points from two images. Returns their inverse depths (K,) [1/m] in the first image, at the point of
     the first ray that is nearest to the second ray.
 
-    ``first``, ``second`` (K, 3): viewing rays in the robot frame at each image, scaled to depth 1 in the camera.
-    ``position`` (3,): position of the camera in the robot frame. ``motion`` (3,): the robot's planar motion between the images.
+    ``first``, ``second`` (K, 3): viewing rays at each image along the robot's axes, scaled to depth 1 in the camera.
+    ``position`` (3,): position of the camera in the robot frame. ``motion`` (3,): the robot's pose at the second image
+    in the frame of its pose at the first image.
 
     An inverse depth is negative for a point behind the camera.
     """
@@ -96,8 +97,8 @@ def inverse_depths(first: Array, second: Array, position: Array, motion: Array) 
 
 @compiled(error_model="numpy")
 def _nearest(centres: Array, directions: Array) -> Array:
-    """The point (3,) with the least squared distances from M rays. ``centres`` (M, 3): starts of the rays.
-    ``directions`` (M, 3): their unit vectors."""
+    """Return the point (3,) with the least sum of squared distances from M rays. ``centres`` (M, 3): starts of the
+    rays. ``directions`` (M, 3): their unit vectors."""
     left, right = np.zeros((3, 3)), np.zeros((3, 1))
     for m in range(len(directions)):
         for i in range(3):
@@ -112,9 +113,9 @@ def _nearest(centres: Array, directions: Array) -> Array:
 def _inform(
     k: Lens, centres: Array, turns: Array, pixels: Array, sigmas: Array, point: Array, robust: float, squared: Array
 ) -> tuple[Array, Array, float]:
-    """The Gauss-Newton system of a ``point`` (3,) in the images of :func:`triangulated`. Returns its information
-    matrix (3, 3), the negative gradient (3, 1) of the loss, and the smallest depth of the point. Writes the squared
-    norms of the whitened residuals into ``squared`` (M,)."""
+    """Return the Gauss-Newton system of a ``point`` (3,) in M images: its information matrix (3, 3), the negative
+    gradient (3, 1) of the loss, and the smallest depth. The images are those of :func:`triangulated`. Writes the
+    squared norms of the whitened residuals into ``squared`` (M,)."""
     information, pull, depth, row, error = np.zeros((3, 3)), np.zeros((3, 1)), np.inf, np.empty(3), np.empty(2)
     for m in range(len(centres)):
         local = product((point - centres[m]).reshape(1, 3), turns[m])

@@ -19,11 +19,12 @@ REWEIGHTED, STILL = 50, 1e-5
 
 
 class PackedImage(NamedTuple):
-    """A :class:`~factors.camera.factor.ReprojectionFactor` on the pose only, for compiled code.
+    """A :class:`~factors.camera.factor.ReprojectionFactor` on the pose only, as a tuple for compiled code.
 
+    ``lens``, ``position``, ``rotation``: the camera. ``points`` (K, 3): world points. ``pixels`` (K, 2): their pixels.
     ``point_covariances``: (K, 3, 3), or (0, 3, 3) for an exact map.
     ``offset`` (3,), ``offset_covariance`` (3, 3): zeros if these fields of the factor are None.
-    The remaining fields are those of the factor and its camera model.
+    ``sigma``, ``robust``, ``tempering``, ``tilt``: fields of :class:`~factors.camera.model.CameraModel`.
     """
 
     lens: Lens
@@ -44,8 +45,9 @@ class PackedImage(NamedTuple):
 def whitened(image: PackedImage, pose: Array, width: int = POINT) -> tuple[Array, Array]:
     """Return the whitened residual (K, 2) of a level robot at ``pose`` (3,), and its Jacobian (K, 2, width).
 
-    The columns of a full Jacobian are the pose (3), the tilt (2) in standard deviations, the point (3), and the
-    camera's constants (8). ``width``: the number of columns to compute. The derivative by the time offset is zero.
+    ``image``: K points in an image. ``width``: the number of columns to compute. The columns of a full Jacobian are the
+    pose (3), the tilt (2) in standard deviations, the point (3), and the camera's constants (8). The derivative by the
+    time offset is zero.
     """
     count, row = len(image.points), np.empty((2, WIDTH))
     residual, jacobian = np.empty((count, 2)), np.empty((count, 2, width))
@@ -93,7 +95,7 @@ def _widened(
     """Add the effect of three uncertain variables to the covariance (uu, uv, vv) of a pixel.
 
     ``covariance`` (3, 3): covariance of the variables. ``row`` (2, WIDTH): the pixel's Jacobian. ``first``: the column
-    of the first variable. ``count``: the added covariance is multiplied by it. Returns the new uu, uv and vv.
+    of the first variable. ``count``: a factor of the added covariance. Returns the new uu, uv and vv.
     """
     p = row[0, first], row[0, first + 1], row[0, first + 2]
     q = row[1, first], row[1, first + 1], row[1, first + 2]
@@ -103,18 +105,20 @@ def _widened(
 
 @compiled(error_model="numpy")
 def linearized(image: PackedImage, pose: Array) -> tuple[Array, Array]:
-    """The whitened residual (2K,) and its Jacobian (2K, 3) by the pose, with robust weights and tempering and with the
-    tilt marginalised, as in :meth:`~factors.camera.factor.ReprojectionFactor.linearize`."""
+    """Return the whitened residual (2K,) of an image at ``pose`` (3,), and its Jacobian (2K, 3) by the pose. Both
+    include robust weights and tempering. Roll and pitch are marginalised."""
     residual, jacobian = whitened(image, pose)
     return marginal(residual, jacobian, image.robust, image.tempering)
 
 
 @compiled(error_model="numpy")
 def tilted(residual: Array, by_tilt: Array, robust: float) -> tuple[float, float, Array]:
-    """Fit roll and pitch to whitened residuals (K, 2), by iteratively reweighted least squares. The cost is convex.
+    """Fit the robot's roll and pitch to K points in an image, by iteratively reweighted least squares. The cost is
+    convex.
 
-    ``by_tilt`` (K, 2, 2): the Jacobian by roll and pitch in standard deviations. ``robust``: the scale of Huber's loss.
-    Returns roll and pitch in standard deviations, and the robust weights (K,) at the solution.
+    ``residual`` (K, 2): the whitened residuals of a level robot. ``by_tilt`` (K, 2, 2): their Jacobian by roll and
+    pitch in standard deviations. ``robust``: the scale of Huber's loss. Returns roll and pitch in standard deviations,
+    and the robust weights (K,) at the solution.
     """
     n, roll, pitch = len(residual), 0.0, 0.0
     weights = np.ones(n)
@@ -139,11 +143,12 @@ def tilted(residual: Array, by_tilt: Array, robust: float) -> tuple[float, float
 
 @compiled(error_model="numpy")
 def marginal(residual: Array, jacobian: Array, robust: float, tempering: float) -> tuple[Array, Array]:
-    """Marginalise the tilt, an error that all K points have in common.
+    """Marginalise the robot's roll and pitch, errors that all K points of an image have in common.
 
-    ``residual`` (K, 2): whitened. ``jacobian`` (K, 2, D + 2): by D variables and, in the last two columns T, by the
-    tilt in standard deviations. ``robust``: the scale of Huber's loss. ``tempering``: the exponent of the likelihood.
-    Returns the residual (2K,) and its Jacobian (2K, D), whitened for the noise with the tilt.
+    ``residual`` (K, 2): whitened. ``jacobian`` (K, 2, D + 2): by D variables and, in the last two columns T, by roll
+    and pitch in standard deviations. ``robust``: the scale of Huber's loss. ``tempering``: the exponent of the
+    likelihood.
+    Returns the residual (2K,) and its Jacobian (2K, D), whitened for a noise that includes roll and pitch.
 
     With the diagonal matrix W of robust weights, the covariance of the residuals is W^-1 + T T'. A square root of its
     inverse is (1 - A C A') W^(1/2), with A = W^(1/2) T, H^2 = 1 + A'A, and C^-1 = H (H + 1). The result is multiplied
@@ -183,7 +188,8 @@ def marginal(residual: Array, jacobian: Array, robust: float, tempering: float) 
 @compiled(error_model="numpy")
 def leaning(image: PackedImage, pose: Array, covariance: Array) -> tuple[Array, Array]:
     """Estimate the robot's roll and pitch from one image, by least squares. ``pose`` (3,), ``covariance`` (3, 3): the
-    prior of the robot's pose. Returns roll and pitch (2,) [rad] and their covariance (2, 2)."""
+    predicted robot pose and its body-frame covariance. Returns roll and pitch (2,) [rad] and their covariance (2,
+    2)."""
     residual, jacobian = whitened(image, pose)
     prior = np.eye(POINT)
     put(inverse(covariance), prior)
@@ -194,14 +200,14 @@ def leaning(image: PackedImage, pose: Array, covariance: Array) -> tuple[Array, 
 
 @compiled(error_model="numpy")
 def placed(position: Array, rotation: Array, tilt: float, pose: Array, covariance: Array) -> tuple[Array, Array, Array]:
-    """The pose of a camera in the world, with its covariance.
+    """Return the pose of a camera in the world, with its covariance.
 
     ``position`` (3,), ``rotation`` (3, 3): the camera's pose in the robot frame.
     ``tilt`` [rad]: the standard deviation of the robot's roll and pitch.
     ``pose`` (3,), ``covariance`` (3, 3): the robot's planar pose, and its body-frame covariance.
 
-    Returns the camera's position (3,) and rotation (3, 3) in the world, and the covariance (6, 6) of its perturbation
-    in the camera frame, with rotation before translation.
+    The results are the camera's position (3,) and rotation (3, 3) in the world, and the covariance (6, 6) of its
+    perturbation in the camera frame, with rotation before translation.
     """
     c, s = math.cos(pose[2]), math.sin(pose[2])
     where, turned, lift, carried = np.empty(3), np.empty((3, 3)), np.zeros((6, POINT)), np.empty((6, 6))
@@ -223,8 +229,9 @@ def placed(position: Array, rotation: Array, tilt: float, pose: Array, covarianc
 
 @compiled(error_model="numpy")
 def pixel_noise(by_point: Array, covariances: Array, sigma: float) -> Array:
-    """The covariances (K, 2, 2) of predicted minus measured pixels. ``by_point`` (K, 2, 3): the Jacobian of the pixels
-    by the points. ``covariances`` (K, 3, 3): covariances of the points. ``sigma`` [px]: the pixel noise."""
+    """Return the covariances (K, 2, 2) [px^2] of predicted minus measured pixels. ``by_point`` (K, 2, 3): the Jacobian
+    of the pixels by the points. ``covariances`` (K, 3, 3): covariances of the points. ``sigma`` [px]: the pixel
+    noise."""
     out = np.empty((len(by_point), 2, 2))
     for k in range(len(by_point)):
         of = covariances[k]
@@ -237,7 +244,7 @@ def pixel_noise(by_point: Array, covariances: Array, sigma: float) -> Array:
 
 @compiled(inline="always")
 def _product(matrix: Array, p: Row, q: Row) -> float:
-    """The bilinear form ``p' matrix q`` of a matrix (3, 3)."""
+    """Return the bilinear form ``p' matrix q`` of a matrix (3, 3)."""
     x = matrix[0, 0] * q[0] + matrix[0, 1] * q[1] + matrix[0, 2] * q[2]
     y = matrix[1, 0] * q[0] + matrix[1, 1] * q[1] + matrix[1, 2] * q[2]
     z = matrix[2, 0] * q[0] + matrix[2, 1] * q[1] + matrix[2, 2] * q[2]

@@ -41,23 +41,25 @@ LEAST_SINGULAR = 1e-6  # minimum singular value of a Jacobian by a landmark, in 
 
 @dataclass(frozen=True, slots=True)
 class BearingRangeFactor:
-    """A factor on the robot's pose from K landmarks measured at one time. The pose may be a slightly earlier one.
+    """A factor on the robot's pose from K landmarks measured at one time. The pose may be the pose at a slightly
+    earlier time.
 
     ``points``: world positions (K, 2) of the landmarks, or (K, 3) with their heights above the sensor.
     ``ranges``, ``bearings``: measurements (K,) [m, rad], NaN where a value is missing.
     ``offset`` (3,): the robot's pose at the time of the measurement in the frame of the estimated pose, from odometry.
     None if the two poses are equal.
     ``offset_covariance`` (3, 3): body-frame covariance of ``offset``. It is added to the noise.
-    ``point_covariances`` (K, 2, 2): covariances of the landmarks of an inexact map. They are added to the noise.
+    ``point_covariances`` (K, 2, 2): covariances of the landmarks, which are added to the noise. None if the map is
+    exact.
     ``estimated``: indices in :data:`PARAMETERS` of the P sensor constants that are estimated.
     ``free``: True if the position of the landmark is estimated. Then K is 1, and the estimate replaces ``points``.
     ``biased``: True if a bias of the ranges is estimated.
     ``twist`` (3,): the robot's body-frame velocity. Required if the time offset is estimated.
     ``simultaneous``: the number of all landmarks measured at this time, also by other factors. None means K. The
-    covariance of ``offset`` is multiplied by this number, so that its error, common to all, does not average out.
+    covariance of ``offset`` is multiplied by this number, because its error is common to all and does not average out.
 
-    The methods take a list of values in this order: the pose (3,), the corrections (P,) of the estimated constants if P
-    > 0, the range bias (1,) [m] if ``biased``, and the landmark's position (2,) if ``free``.
+    The methods take ``values``, a list in this order: the pose (3,), the corrections (P,) of the estimated constants if
+    P > 0, the range bias (1,) [m] if ``biased``, and the landmark's position (2,) if ``free``.
     """
 
     model: BearingRangeModel
@@ -74,7 +76,8 @@ class BearingRangeFactor:
     simultaneous: int | None = None
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """The whitened residual (2K,) with robust weights, and its Jacobian (2K, d) by each value."""
+        """Return the whitened residual (2K,) with robust weights, and a list of its Jacobians (2K, d), one for each
+        variable. ``values``: the variables, as in the class docstring."""
         if not (self.free or self.biased):
             constants = values[1] if self.estimated else NOTHING
             linear = kernels.weighted(self.model.packed, self.packed, values[0], constants, self.places)
@@ -93,7 +96,8 @@ class BearingRangeFactor:
         return None if self.free or self.biased else (self.estimated, self.model)
 
     def stack(self, factors: Sequence[BearingRangeFactor], numbers: Sequence[int], column: int) -> BearingRangeStack:
-        """Combine factors of the same ``kind`` into one object, for speed. See :class:`~factors.graph.Stackable`."""
+        """Combine factors of the same ``kind`` into one object, which is linearised faster. ``numbers``: the index of
+        each factor's pose. ``column``: the index of the first sensor constant in the parameters of the graph."""
         return BearingRangeStack(factors, numbers, column)
 
     def count_beyond(self, limit: float, pose: Array, covariance: Array) -> int:
@@ -121,22 +125,23 @@ class BearingRangeFactor:
         return _places(self.estimated)
 
     def cost(self, values: Sequence[Array]) -> float:
-        """The robust loss, summed over the landmarks."""
+        """Return the robust loss, summed over the landmarks. ``values``: the variables, as in the class docstring."""
         error, _, slopes = self._linearized(values)
         return float(losses.loss(self.model.packed, error, slopes))
 
     def log_likelihood(self, poses: Array, parameters: Array | None = None) -> Array:
-        """The log-likelihood (N,), up to a constant, of ``poses`` (N, 3) at the time of the measurement. ``parameters`` (N, 6):
-        corrections of the sensor constants for each pose. See :func:`~factors.landmarks.model.log_likelihood`."""
+        """Return the log-likelihood (N,), up to a constant, of ``poses`` (N, 3) at the time of the measurement.
+        ``parameters`` (N, 6): corrections of the sensor constants for each pose, see
+        :func:`~factors.landmarks.model.log_likelihood`."""
         measured = self.points, self.ranges, self.bearings
         return log_likelihood(self.model, poses, *measured, parameters, self.point_covariances)
 
     def weight(self, squared: Array) -> Array:
-        """The robust weights of ``squared`` norms of whitened residuals."""
+        """Return the robust weights (K,) for ``squared`` (K,), the squared norms of whitened residuals."""
         return geman_mcclure_weight(squared, self.model.robust)
 
     def widened(self, width: float) -> BearingRangeFactor:
-        """The factor with the scale of its robust loss multiplied by ``width``."""
+        """Return the factor with the scale of its robust loss multiplied by ``width``."""
         return self if width == 1.0 else replace(self, model=widened(self.model, width))
 
     def with_late(self, late: LateRanges) -> BearingRangeFactor:
@@ -144,14 +149,15 @@ class BearingRangeFactor:
         return self if late == self.model.late else replace(self, model=with_late(self.model, late))
 
     def predicted(self, pose: Array, covariance: Array) -> tuple[Array, Array, Array]:
-        """Compute the arguments of :meth:`~factors.landmarks.late.LateShares.updated`, three arrays (K,), at a
-        predicted ``pose`` (3,) with body-frame ``covariance`` (3, 3). The factor must depend on the pose only."""
+        """Return three arrays (K,): errors, slopes and variances of the ranges, as in
+        :meth:`~factors.landmarks.late.LateShares.updated`. ``pose`` (3,), ``covariance`` (3, 3): the prediction. The
+        factor must depend on the pose only."""
         contiguous = np.ascontiguousarray(covariance)
         return kernels.predicted(self.model.packed, self.packed, pose, contiguous)
 
     def resolved(self, values: Sequence[Array], covariance: Array) -> ResolvedFactor:
-        """Replace ranges that may be late by Gaussian measurements, at the predicted ``values`` of the variables with
-        the joint ``covariance`` (D, D). Returns the factor for a Kalman update of this prediction."""
+        """Return the factor with Gaussian measurements in place of ranges that may be too long, for a Kalman update. It
+        is valid for one prediction: the ``values`` of the variables with the joint ``covariance`` (D, D)."""
         error, blocks, slopes = self._linearized(values)
         jacobian, changed, weights = np.concatenate(blocks, axis=2), error.copy(), np.ones(len(error))
         columns, contiguous = np.arange(len(covariance)), np.ascontiguousarray(covariance)
@@ -160,12 +166,13 @@ class BearingRangeFactor:
         return ResolvedFactor(self, (changed - error)[:, 0], np.sqrt(weights))
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Return the whitened residual (K, 2), predicted minus measured, and its Jacobian (K, 2, d) by each value.
-        Robust weights are not included."""
+        """Return the whitened residual (K, 2), predicted minus measured, and a list of its Jacobians (K, 2, d), one for
+        each variable. ``values``: the variables, as in the class docstring. Robust weights are not included."""
         return self._linearized(values)[:2]
 
     def _linearized(self, values: Sequence[Array]) -> tuple[Array, list[Array], Array]:
-        """Return the results of :meth:`whitened` and of :func:`~factors.landmarks.losses.slopes`."""
+        """Return the results of :meth:`whitened` and, as a third value, those (K,) of
+        :func:`~factors.landmarks.losses.slopes`."""
         error, jacobian = self._whitened(values)
         blocks, slopes = self._blocks(jacobian), np.empty(len(error))
         losses.slopes(error, jacobian, self._shortened(values), self.bearings, slopes)
@@ -175,12 +182,12 @@ class BearingRangeFactor:
         return error, blocks, slopes
 
     def _shortened(self, values: Sequence[Array]) -> Array:
-        """The ranges (K,) minus the range bias."""
+        """Return the ranges (K,) minus the range bias."""
         return self.ranges - values[1 + bool(self.estimated)][0] if self.biased else self.ranges
 
     def _whitened(self, values: Sequence[Array], bias: float = 0.0) -> tuple[Array, Array]:
-        """The whitened residual (K, 2) with ``bias`` [m] added to the range bias, and its Jacobian (K, 2, WIDTH) by the
-        pose, the landmark and all sensor constants."""
+        """Return the whitened residual (K, 2) with ``bias`` [m] added to the range bias, and its Jacobian (K, 2, WIDTH)
+        by the pose, the landmark and all sensor constants."""
         packed, changes, count = self.packed, np.zeros(len(PARAMETERS)), len(self.ranges)
         if self.estimated:
             changes[list(self.estimated)] = values[1]
@@ -202,7 +209,7 @@ class BearingRangeFactor:
         return blocks
 
     def fixed(self, parameters: Sequence[Array], point: Array | None, bias: float = 0.0) -> BearingRangeFactor:
-        """Return a factor on the pose only. The remaining variables are fixed.
+        """Return a factor on the pose only, with the other variables fixed at the given values.
 
         ``parameters``: a sequence of one array (P,), the corrections of the estimated constants, or an empty sequence.
         ``point`` (2,): the position of a free landmark, otherwise None.
@@ -222,11 +229,12 @@ class BearingRangeFactor:
         )
 
     def _placed(self, point: Array) -> Array:
-        """The landmark's ``point`` (2,) as an array (1, 2), or (1, 3) with its height if ``points`` has heights."""
+        """Return the landmark's ``point`` (2,) as an array (1, 2), or (1, 3) with its height if ``points`` has
+        heights."""
         return np.concatenate((np.reshape(point, (1, 2)), self.points[:1, HEIGHT:]), axis=1)
 
     def dof(self) -> int:
-        """Number of measured ranges and bearings."""
+        """Return the number of measured ranges and bearings."""
         return int(np.count_nonzero(~np.isnan(self.ranges)) + np.count_nonzero(~np.isnan(self.bearings)))
 
     def locate(self, values: Sequence[Array]) -> tuple[Array, list[Array], Array]:
@@ -249,25 +257,26 @@ class BearingRangeFactor:
 
 @dataclass(frozen=True)
 class ResolvedFactor:
-    """A landmark ``factor`` with ranges that may be late replaced by Gaussian measurements. ``shift`` (K,): is added to
-    the whitened range residuals. ``root`` (K,): the square roots of the weights of the measurements."""
+    """A landmark ``factor`` for one Kalman update, with Gaussian measurements in place of ranges that may be too long.
+    ``shift`` (K,): is added to the whitened range residuals. ``root`` (K,): the square roots of the measurements'
+    weights."""
 
     factor: BearingRangeFactor
     shift: Array
     root: Array
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """The whitened residual (K, 2) and its Jacobian (K, 2, d) by each value."""
+        """Return the whitened residual (K, 2) and a list of its Jacobians (K, 2, d), one for each variable."""
         error, blocks = self.factor.whitened(values)
         error[:, 0] += self.shift
         return self.root[:, None] * error, [self.root[:, None, None] * block for block in blocks]
 
     def weight(self, squared: Array) -> Array:
-        """The robust weights of ``squared`` norms of whitened residuals."""
+        """Return the robust weights (K,) for ``squared`` (K,), the squared norms of whitened residuals."""
         return self.factor.weight(squared)
 
     def dof(self) -> int:
-        """Number of measured ranges and bearings."""
+        """Return the number of measured ranges and bearings."""
         return self.factor.dof()
 
 
@@ -280,12 +289,14 @@ def landmark_update(
     iterations: int,
     converged: float = CONVERGED,
 ) -> Correction | None:
-    """Correct a Gaussian by landmarks of the map. A compiled equivalent of :func:`~factors.update.update_state`.
+    """Correct the Gaussian estimate of a robot pose by landmarks of the map, with an iterated Kalman update. A compiled
+    equivalent of :func:`~factors.update.update_state`.
 
     ``pose`` (3,): the predicted pose. ``covariance`` (S, S): the covariance of the error state. Its first three
-    components are the pose. ``constants`` (P,): corrections of the estimated sensor constants, which are the components
-    of the error state from index ``first`` on. ``iterations``, ``converged``: as in ``update_state``. Returns None if
-    ``update_state`` must be used: for a free landmark, a bias, or a numerically singular information form.
+    components are the pose. ``constants`` (P,): corrections of the estimated sensor constants. They are the components
+    of the error state from index ``first`` on. ``iterations``: their maximum number. They end earlier when a step is
+    below ``converged``. Returns None for a free landmark, a range bias or a numerically singular matrix. Call
+    ``update_state`` then.
     """
     if factor.free or factor.biased:
         return None
@@ -298,7 +309,8 @@ def landmark_update(
 
 
 class BearingRangeStack:
-    """Several factors with the same model and the same estimated constants, linearised together. No landmark is free.
+    """Several landmark factors with the same model and the same estimated constants, linearised together. No landmark
+    is free.
 
     ``factors``: L factors.
     ``pose_of`` (L,): the index of the pose that each factor depends on.
@@ -327,12 +339,13 @@ class BearingRangeStack:
 
     @property
     def first(self) -> Integers:
-        """The index (2 K,) of the pose that each residual depends on, for K landmarks in all factors."""
+        """The index (2 K,) of the pose that each residual depends on, for the K landmarks of all factors together."""
         return np.repeat(np.repeat(self._pose_of, np.diff(self._ends, prepend=0)), 2)
 
     def linearize(self, poses: Array, parameters: Array, jacobian: Array, residual: Array) -> None:
-        """Write the whitened residuals with robust weights into ``residual`` (2 K,), and their Jacobian by the pose,
-        the next pose and the P parameters into ``jacobian`` (2 K, 6 + P)."""
+        """Write the whitened residuals with robust weights into ``residual`` (2 K,), for ``poses`` (N, 3) and
+        ``parameters`` (P,). Write their Jacobian by the pose, the next pose and the parameters into ``jacobian`` (2 K,
+        6 + P)."""
         error, by_all, slopes = self._whitened(poses, parameters)
         losses.weigh(self._model, error, by_all, slopes)
         by_all = by_all.reshape(len(residual), WIDTH)
@@ -341,7 +354,7 @@ class BearingRangeStack:
         jacobian[:, 6 + self._column : 6 + end] = by_all[:, CONSTANTS:][:, self._estimated]
 
     def cost(self, poses: Array, parameters: Array) -> float:
-        """The robust loss at ``poses`` (N, 3) and ``parameters`` of the graph, summed over all factors."""
+        """Return the robust loss at ``poses`` (N, 3) and ``parameters`` (P,) of the graph, summed over all factors."""
         error, _, slopes = self._whitened(poses, parameters)
         return float(losses.loss(self._model, error, slopes))
 

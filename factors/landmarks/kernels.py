@@ -36,12 +36,15 @@ Sighting = tuple[Array, Array, Array, bool, Array, bool, Array, float, bool, Arr
 
 @compiled
 def linearize(model: Array, pose: Array, changes: Array, packed: Sighting, error: Array, jacobian: Array) -> None:
-    """Linearise one measurement as :meth:`factors.landmarks.factor.BearingRangeFactor.whitened` does.
+    """Linearise one measurement of K landmarks. It gives the result of
+    :meth:`factors.landmarks.factor.BearingRangeFactor.whitened`.
 
-    ``model`` (14,): the array ``packed`` of a :class:`~factors.landmarks.model.BearingRangeModel`.
-    ``changes`` (6,): corrections of the sensor constants.
+    ``model`` (14,): the array ``packed`` of a :class:`~factors.landmarks.model.BearingRangeModel`. ``pose`` (3,): the
+    robot pose.
+    ``changes`` (6,): corrections of the sensor constants. ``packed``: the measurement as a tuple, see :data:`Sighting`.
     ``error`` (K, 2): output, the whitened residual. Must contain zeros before the call.
-    ``jacobian`` (K, 2, WIDTH): output, its Jacobian. Must contain zeros before the call.
+    ``jacobian`` (K, 2, WIDTH): output, its Jacobian by pose, landmark and constants. Must contain zeros before the
+    call.
     """
     points, ranges, bearings, displaced, offset, widened, covariance, count, moves, twist, surveys = packed
     x, y, turned = offset[0], offset[1], offset[2]
@@ -105,7 +108,8 @@ def linearize_each(model: Array, poses: Array, points: Array, ranges: Array, bea
 
 @compiled
 def _widen(error: Array, jacobian: Array, uu: float, uv: float, vv: float) -> None:
-    """Whiten the ``error`` (2,) of a landmark and its ``jacobian`` (2, WIDTH) by a covariance [[uu, uv], [uv, vv]], in place."""
+    """Whiten the ``error`` (2,) of a landmark and its ``jacobian`` (2, WIDTH) by the covariance [[uu, uv], [uv, vv]],
+    in place."""
     # [[p, 0], [r, q]] is the inverse of the lower Cholesky root of the covariance
     p = 1.0 / math.sqrt(uu)
     low = uv * p
@@ -133,8 +137,8 @@ def _carried(jacobian: Array, covariance: Array) -> tuple[float, float, float]:
 
 @compiled(error_model="numpy")
 def beyond(model: Array, pose: Array, packed: Sighting, covariance: Array, limit: float) -> int:
-    """Count the landmarks in the measurement ``packed`` with a normalised innovation squared above ``limit``, at a
-    ``pose`` (3,) with body-frame ``covariance`` (3, 3)."""
+    """Return the number of landmarks with a normalised innovation squared above ``limit``. ``model``, ``packed``: as in
+    :func:`linearize`. ``pose`` (3,), ``covariance`` (3, 3): the predicted pose and its body-frame covariance."""
     count = len(packed[0])
     error, by_pose, outliers = np.zeros((count, 2)), np.zeros((count, 2, WIDTH)), 0
     linearize(model, pose, np.zeros(TIME_OFFSET + 1), packed, error, by_pose)
@@ -164,10 +168,10 @@ def linearize_all(
     error: Array,
     jacobian: Array,
 ) -> None:
-    """Linearise L measurements with :func:`linearize`. All their landmarks together are K rows.
+    """Linearise L measurements with :func:`linearize`. Together they have K landmarks, one per row of the arrays.
 
-    ``poses`` (N, 3), ``pose_of`` (L,): poses, and the index of the pose of each measurement.
-    ``ends`` (L,): the end row of each measurement (exclusive).
+    ``poses`` (N, 3), ``pose_of`` (L,): poses, and the index of the pose of each measurement. ``changes`` (6,):
+    corrections of the sensor constants. ``ends`` (L,): the end row of each measurement (exclusive).
     ``measured``: points, ranges and bearings, with K rows each.
     ``flags`` (L, 4): True where a measurement has an offset, an offset covariance, a velocity, and point covariances.
     ``offsets`` (L, 3), ``covariances`` (L, 3, 3), ``twists`` (L, 3): the offset, its covariance and the velocity of
@@ -200,8 +204,9 @@ def updated(
     gate: float,
 ) -> tuple[Array, Array, Array, float, int]:
     """The robust, iterated Kalman update by one measurement of landmarks. See :func:`factors.update.update_state`.
-    ``model`` (14,): the array ``packed`` of a :class:`~factors.landmarks.model.BearingRangeModel`.
-    ``pose`` (3,), ``covariance`` (S, S): the prediction. The first three components of the error state are the pose.
+    ``model`` (14,): the array ``packed`` of a :class:`~factors.landmarks.model.BearingRangeModel`. ``packed``: the
+    measurement, see :data:`Sighting`. ``pose`` (3,), ``covariance`` (S, S): the prediction. The first three components
+    of the error state are the pose.
     ``values`` (P,): corrections of the estimated sensor constants at the prediction.
     ``indices`` (P,): the indices of these constants in :data:`~factors.landmarks.model.PARAMETERS`.
     ``first``: the index of the first of these constants in the error state.
@@ -253,8 +258,8 @@ def updated(
 def weighted(
     model: Array, packed: Sighting, pose: Array, values: Array, indices: Integers
 ) -> tuple[Array, Array, Array]:
-    """Return the whitened residual (2K,) with robust weights, and its Jacobians by the pose (2K, 3) and the estimated
-    constants (2K, P). The arguments are those of :func:`updated`."""
+    """Return the whitened residual (2K,) of K landmarks with robust weights, and its Jacobians by the pose (2K, 3) and
+    the estimated constants (2K, P). The arguments are those of :func:`updated`."""
     count, wide = len(packed[0]), len(indices)
     residual, jacobian, slope = np.empty((count, 2)), np.empty((count, 2, 3 + wide)), np.empty(count)
     _linearized(model, packed, pose, values, indices, residual, jacobian, slope)
@@ -265,8 +270,9 @@ def weighted(
 
 @compiled(error_model="numpy")
 def predicted(model: Array, packed: Sighting, pose: Array, covariance: Array) -> tuple[Array, Array, Array]:
-    """Return the whitened errors (K,) of the ranges in ``packed``, their :func:`slopes` (K,), and the variances (K,) of
-    the predicted ranges relative to the noise. ``pose`` (3,), ``covariance`` (3, 3): the prediction."""
+    """Return three arrays (K,) about the ranges in ``packed``, to detect late ranges: the whitened errors, their
+    derivatives by the range (:func:`slopes`), and the variances of the predicted ranges divided by the variance of the
+    noise. ``model``: as in :func:`linearize`. ``pose`` (3,), ``covariance`` (3, 3): the predicted robot pose."""
     count = len(packed[0])
     error, jacobian, slope, variances = (
         np.zeros((count, 2)),
@@ -283,10 +289,10 @@ def predicted(model: Array, packed: Sighting, pose: Array, covariance: Array) ->
 
 @compiled(error_model="numpy")
 def innovations(model: Array, residual: Array, ranges: Array, bearings: Array) -> tuple[Array, Array]:
-    """Convert whitened residuals to innovations. ``residual`` (K, 2): whitened, predicted minus measured.
+    """Convert whitened residuals (K, 2), predicted minus measured, to innovations in metres and radians.
 
-    ``ranges``, ``bearings`` (K,): measured, NaN if missing. Returns measured minus predicted ranges [m] and bearings
-    [rad]. Missing values are left out.
+    ``model``: as in :func:`linearize`. ``ranges``, ``bearings`` (K,): measured, NaN if missing. Returns two arrays,
+    measured minus predicted ranges [m] and bearings [rad]. They are shorter than K if values are missing.
     """
     by_range, by_bearing = np.empty(len(ranges)), np.empty(len(ranges))
     r = b = 0

@@ -38,8 +38,9 @@ LEAST_INFORMATION = 0.2
 
 
 class LateRanges(NamedTuple):
-    """The statistics of late ranges, which are too long because the signal was reflected. ``share``: the probability
-    that a range is late. ``mean``, ``sigma`` [m]: mean and standard deviation of the excess of a late range."""
+    """The statistics of late ranges. These are ranges that are too long, because the signal was reflected. ``share``:
+    the fraction of ranges that are late. ``mean``, ``sigma`` [m]: mean and standard deviation of the excess of a late
+    range."""
 
     share: float = 0.0
     mean: float = 0.0
@@ -53,14 +54,15 @@ NONE = LateRanges()
 def mixture(
     error: float, slope: float, robust: float, share: float, mean: float, sigma: float
 ) -> tuple[float, float, float]:
-    """Return the negative log-likelihood of a range that may be late, its derivative by ``error``, and the information.
+    """Return the negative log-likelihood of a range that may be late, its derivative by ``error``, and the Fisher
+    information about ``error``. A late range is too long, because the signal was reflected.
 
     ``error``: the predicted minus the measured range in standard deviations.
-    ``slope``: the inverse of the standard deviation [1/m].
-    ``robust``: the scale of the Geman-McClure loss. ``share``, ``mean``, ``sigma``: those of :class:`LateRanges`.
+    ``slope``: the inverse of the standard deviation of a range [1/m].
+    ``robust``: the scale of the Geman-McClure loss. ``share``, ``mean``, ``sigma``: the fields of :class:`LateRanges`.
 
-    The information about ``error`` is the mean information of a direct and a late range, minus the variance of the
-    derivative (Louis, Journal of the Royal Statistical Society B 44(2), 1982). It has a positive minimum.
+    The information is the mean information of a direct and a late range, minus the variance of the derivative (Louis,
+    Journal of the Royal Statistical Society B 44(2), 1982). It has a positive minimum.
     """
     widening = 1.0 + (slope * sigma) ** 2
     beyond = error + slope * mean
@@ -82,7 +84,7 @@ def mixture(
 def moments(
     error: float, slope: float, variance: float, robust: float, gate: float, share: float, mean: float, sigma: float
 ) -> tuple[float, float, float]:
-    """Replace a range that may be late by a Gaussian measurement with the same effect on a prediction.
+    """Replace a range that may be late (too long) by a Gaussian measurement with the same effect on a prediction.
 
     ``variance``: the variance of the predicted range divided by the variance of the noise. ``gate``: the noise is
     increased if a normalised innovation squared exceeds this limit. The other arguments are those of :func:`mixture`.
@@ -122,7 +124,8 @@ _PARTS = len(MEANS) * len(RELATIVE_SIGMAS)  # number of successive hypotheses wi
 
 @lru_cache(maxsize=16)
 def _prior(probability: float) -> Array:
-    """The log priors (noises, 1 + H) of no late range (first column) and of H distributions of late ranges."""
+    """Return the log priors (noises, 1 + H) of the hypotheses. The first column is the hypothesis that no range is
+    late. ``probability``: the prior probability that the sensor has late ranges."""
     biased = BIASED * (1.0 - probability)
     excess = np.where(_IS_LATE, probability, biased) / _MEANS
     for group in (_IS_LATE, ~_IS_LATE):
@@ -133,11 +136,12 @@ def _prior(probability: float) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class LateShares:
-    """The estimated distribution of the late ranges of a sensor. Immutable.
+    """A Bayesian filter that estimates how many ranges of a sensor are late (too long), and by how much. Immutable.
 
     ``probability``: the prior probability that the sensor has late ranges.
-    ``log_weights`` (noises, 1 + H): the logarithms of the posterior probabilities of all hypotheses. None means the
-    prior. ``expected``: the statistics of late ranges, averaged over all hypotheses.
+    ``log_weights`` (noises, 1 + H): log posterior probabilities of hypotheses, for a few noise levels of direct ranges
+    and for no or one of H distributions of late ranges. None means the prior.
+    ``expected``: the statistics of late ranges, averaged over all hypotheses.
     """
 
     probability: float
@@ -148,7 +152,8 @@ class LateShares:
         object.__setattr__(self, "expected", self._expected())
 
     def _expected(self) -> LateRanges:
-        """The share of late ranges, and the moments of their excess, averaged over all hypotheses."""
+        """Return the share of late ranges, and mean and standard deviation of their excess, averaged over all
+        hypotheses."""
         if self.probability == 0.0:
             return NONE
         logs = _prior(self.probability) if self.log_weights is None else self.log_weights
@@ -156,7 +161,7 @@ class LateShares:
         return LateRanges(_rounded(share), _rounded(mean), _rounded(sigma)) if share >= LEAST else NONE
 
     def updated(self, errors: Array, slopes: Array, variances: Array) -> LateShares:
-        """Return the distribution after K ranges.
+        """Return the filter after K measured ranges.
 
         ``errors`` (K,): the predicted minus the measured ranges in standard deviations. ``slopes`` (K,): the inverse
         standard deviations [1/m], 0 for measurements that cannot be late. ``variances`` (K,): the variances of the
@@ -203,8 +208,8 @@ def _learnt(
 
 @compiled(error_model="numpy")
 def _averaged(logs: Array, shares: Array, means: Array, sigmas: Array) -> tuple[float, float, float]:
-    """The share of late ranges, and the mean and standard deviation of their excess, averaged over all hypotheses. The
-    arguments are those of :func:`_learnt`."""
+    """Return the share of late ranges, and the mean and standard deviation [m] of their excess, averaged over all
+    hypotheses. The arguments are those of :func:`_learnt`."""
     share = first = second = 0.0
     for j in range(len(shares)):
         if shares[j] < 1.0:

@@ -13,9 +13,9 @@ from factors.se2 import Array, Integers
 
 @compiled
 def slopes(error: Array, jacobian: Array, ranges: Array, bearings: Array, out: Array) -> None:
-    """Compute the derivatives ``out`` (K,) [1/m] of whitened range residuals by the predicted ranges. The derivative is
-    0 for a landmark without range, or with a bearing. ``error`` (K, 2), ``jacobian`` (K, 2, WIDTH): the outputs of
-    :func:`factors.landmarks.kernels.linearize`."""
+    """Write the derivatives of K whitened range residuals by the predicted ranges into ``out`` (K,) [1/m]. The
+    derivative is 0 for a landmark without range, or with a bearing. ``error`` (K, 2), ``jacobian`` (K, 2, WIDTH): the
+    outputs of :func:`factors.landmarks.kernels.linearize`. ``ranges``, ``bearings`` (K,): measured, NaN if missing."""
     for k in range(len(ranges)):
         alone = math.isnan(bearings[k]) and not math.isnan(ranges[k])
         # the residual is (predicted - measured) * slope, and its derivative by the relative range scale is predicted * slope
@@ -38,9 +38,9 @@ def loss(model: Array, error: Array, slopes: Array) -> float:
 
 @compiled
 def reweigh(model: Array, error: Array, slopes: Array, weights: Array) -> None:
-    """Compute the ``weights`` (K,) of the squared residuals for iteratively reweighted least squares. The ``error`` of
-    a range that may be late changes in place, so that the product of weight and error is the derivative of the loss.
-    The other arguments are those of :func:`loss`."""
+    """Write the weights of K squared residuals for iteratively reweighted least squares into ``weights`` (K,). The
+    ``error`` of a range that may be late (too long) changes in place, so that weight times error is the derivative of
+    the loss. The other arguments are those of :func:`loss`."""
     for k in range(len(error)):
         if slopes[k] > 0.0 and model[LATE] > 0.0:
             late = model[ROBUST], model[LATE], model[LATE + 1], model[LATE + 2]
@@ -76,8 +76,8 @@ def resolve(
     weights: Array,
     squared: Array,
 ) -> bool:
-    """Replace ranges that may be late by Gaussian measurements (:func:`factors.landmarks.late.moments`). Changes their
-    ``error``, ``weights`` and ``squared`` in place. Returns True if there are such ranges.
+    """Replace ranges that may be late (too long) by Gaussian measurements, see :func:`factors.landmarks.late.moments`.
+    Changes their elements of ``error``, ``weights`` and ``squared`` in place. Returns True if there are such ranges.
 
     ``error`` (K, 2), ``jacobian`` (K, 2, D): whitened residuals at the prediction, and their Jacobian. ``columns``
     (D,): the components of the state that the residuals depend on. ``covariance`` (S, S): covariance of the state.

@@ -34,13 +34,13 @@ MINIMUM_COSINE = 0.1  # limit of the field of view of depth sensors
 
 @dataclass(frozen=True, slots=True)
 class BearingRangeModel:
-    """A landmark sensor and its noise.
+    """A sensor of ranges and bearings to landmarks, its mounting on the robot, and its noise.
 
     ``mounting``: (x, y, heading) of the sensor in the robot frame [m, m, rad].
     ``range_scale``: the reported range divided by the true range.
-    ``depth``: True if ranges are measured along one axis. ``depth_axis``: the direction of this axis in the sensor
-    frame [rad]. ``range_sigma`` [m], ``range_sigma_relative``: the standard deviation of a range r is
-    ``hypot(range_sigma, range_sigma_relative * r)``.
+    ``depth``: True if ranges are measured along one axis, as by a depth camera. ``depth_axis``: the direction of this
+    axis in the sensor frame [rad]. ``range_sigma`` [m], ``range_sigma_relative``: the standard deviation of a range r
+    is ``hypot(range_sigma, range_sigma_relative * r)``.
     ``bearing_bias``, ``bearing_sigma``: offset and standard deviation of bearings [rad].
     ``robust``: the scale of the Geman-McClure loss in standard deviations.
     ``late``: the statistics of ranges that are too long because of reflections. Ranges with a bearing are never late.
@@ -67,7 +67,8 @@ class BearingRangeModel:
 
 
 def predict(model: BearingRangeModel, poses: Array, points: Array) -> tuple[Array, Array]:
-    """Predict the ranges [m] and bearings [rad] of ``points`` from robot ``poses`` (..., 3).
+    """Return the predicted ranges [m] and bearings [rad], two arrays (...), of ``points`` from robot ``poses`` (...,
+    3).
 
     ``points``: world positions (..., 2), or (..., 3) with the height above the sensor as third coordinate.
     """
@@ -83,8 +84,8 @@ def predict(model: BearingRangeModel, poses: Array, points: Array) -> tuple[Arra
 
 
 def on_floor(model: BearingRangeModel, points: Array, ranges: Array) -> Array:
-    """Convert slant ranges (K,) to ranges along the floor. ``points``: (K, 3) with the height above the sensor as third
-    coordinate. If the points (K, 2) have no heights, the ranges are returned unchanged."""
+    """Convert slant ranges (K,) [m] to ranges (K,) [m] along the floor. ``points``: (K, 3) with the height above the
+    sensor as third coordinate. If the points (K, 2) have no heights, the ranges are returned unchanged."""
     if points.shape[1] <= HEIGHT:
         return ranges
     squared = np.square(ranges / model.range_scale) - np.square(points[:, HEIGHT])
@@ -92,7 +93,8 @@ def on_floor(model: BearingRangeModel, points: Array, ranges: Array) -> Array:
 
 
 def located(model: BearingRangeModel, ranges: Array, bearings: Array) -> Array:
-    """The positions (K, 2) in the robot frame of landmarks with measured ranges (K,) and bearings (K,)."""
+    """Return the positions (K, 2) [m] in the robot frame of landmarks with measured ranges (K,) [m] and bearings (K,)
+    [rad]."""
     direction = bearings - model.bearing_bias
     distance = ranges / model.range_scale
     if model.depth:
@@ -102,7 +104,8 @@ def located(model: BearingRangeModel, ranges: Array, bearings: Array) -> Array:
 
 
 def sigmas(model: BearingRangeModel, ranges: Array) -> Array:
-    """The standard deviations (K, 2) of range and bearing at measured ``ranges`` (K,). A missing range (NaN) counts as 0 m."""
+    """Return the standard deviations (K, 2) [m, rad] of range and bearing at measured ``ranges`` (K,). A missing range
+    (NaN) counts as 0 m."""
     ranges = np.where(np.isnan(ranges), 0.0, ranges)
     out = np.empty((len(ranges), 2))
     out[:, 0] = np.hypot(model.range_sigma, model.range_sigma_relative * ranges)
@@ -111,8 +114,9 @@ def sigmas(model: BearingRangeModel, ranges: Array) -> Array:
 
 
 def residuals(model: BearingRangeModel, poses: Array, points: Array, ranges: Array, bearings: Array) -> Array:
-    """The whitened residuals (..., K, 2) of K points (K, 2), predicted minus measured. ``poses``: (..., 1, 3) or (3,).
-    A residual is zero where the range or bearing is missing (NaN)."""
+    """Return the whitened residuals (..., K, 2) of range and bearing to K points (K, 2), predicted minus measured.
+    ``poses``: (..., 1, 3) or (3,). ``ranges``, ``bearings`` (K,): measured. A residual is zero if the measurement is
+    NaN (missing)."""
     expected_range, expected_bearing = predict(model, poses, points)
     sigma = sigmas(model, ranges)
     error = np.empty((*np.shape(expected_range), 2))
@@ -123,8 +127,9 @@ def residuals(model: BearingRangeModel, poses: Array, points: Array, ranges: Arr
 
 
 def recalibrated(model: BearingRangeModel, parameters: Sequence[float]) -> BearingRangeModel:
-    """The model with corrected constants. ``parameters`` (6,): additive corrections of :data:`PARAMETERS`, except that the range
-    scale is multiplied by one plus its correction. The time offset is ignored, because it is not part of the model."""
+    """Return the model with corrected constants. ``parameters`` (6,): corrections of :data:`PARAMETERS`. They are
+    added, except that the range scale is multiplied by one plus its correction. The time offset is ignored, because it
+    is not part of the model."""
     by_x, by_y, by_bearing, by_scale, by_axis, _ = parameters
     x, y, turn = model.mounting
     return BearingRangeModel(
@@ -142,7 +147,7 @@ def recalibrated(model: BearingRangeModel, parameters: Sequence[float]) -> Beari
 
 @lru_cache(maxsize=64)
 def widened(model: BearingRangeModel, width: float) -> BearingRangeModel:
-    """The model with the scale of its robust loss multiplied by ``width``."""
+    """Return the model with the scale of its robust loss multiplied by ``width``."""
     return replace(model, robust=width * model.robust)
 
 
@@ -153,7 +158,8 @@ def with_late(model: BearingRangeModel, late: LateRanges) -> BearingRangeModel:
 
 
 def _constants(model: BearingRangeModel, parameters: Array) -> Array:
-    """The constants (..., 5) of a model with corrections ``parameters`` (..., 6), in the order of :data:`PARAMETERS`."""
+    """Return the constants (..., 5) of a model with corrections ``parameters`` (..., 6), in the order of
+    :data:`PARAMETERS`."""
     x, y, _ = model.mounting
     out: Array = (
         np.array((x, y, model.bearing_bias, model.range_scale, model.depth_axis)) + parameters[..., :TIME_OFFSET]
@@ -228,13 +234,14 @@ def _whitened(
     measured_range: float,
     measured_bearing: float,
 ) -> tuple[float, float, float, float, float, float, float]:
-    """The whitened errors of range and bearing of one point, and intermediate values for derivatives.
+    """Return the whitened errors of range and bearing of one point, and intermediate values for derivatives.
 
     ``sx``, ``sy``, ``height``: the vector from the sensor to the point, along the robot's axes [m]. ``turn``: heading
     of the sensor in the robot frame. ``ahead_x``, ``ahead_y``: unit vector of the depth axis in the robot frame.
 
-    Returns the errors of range and bearing, the point's distance along the floor, the derivatives of the unscaled range
-    by ``sx`` and ``sy``, the unscaled range, and the range's inverse standard deviation. Missing values are zero.
+    The results are the errors of range and bearing, the point's distance along the floor, the derivatives of the
+    unscaled range by ``sx`` and ``sy``, the unscaled range, and the range's inverse standard deviation. Missing values
+    are zero.
     """
     range_scale, range_sigma, range_sigma_relative, bearing_bias, bearing_sigma = model
     range_error, bearing_error, weight = 0.0, 0.0, 0.0
@@ -265,11 +272,12 @@ def log_likelihood(
     parameters: Array | None = None,
     point_covariances: Array | None = None,
 ) -> Array:
-    """The log-likelihood (N,), up to a constant, of K landmark measurements at ``poses`` (N, 3).
+    """Return the log-likelihood (N,), up to a constant, of K landmark measurements at ``poses`` (N, 3).
 
-    ``points``: world positions (K, 2), or (K, 3) with heights. ``ranges``, ``bearings`` (K,): NaN where missing.
+    ``points``: world positions (K, 2), or (K, 3) with heights above the sensor. ``ranges``, ``bearings`` (K,): NaN
+    where missing.
     ``parameters`` (N, 6): corrections of :data:`PARAMETERS` for each pose, as in :func:`recalibrated`.
-    ``point_covariances`` (K, 2, 2): covariances of the points of an inexact map. They are added to the measurement noise.
+    ``point_covariances`` (K, 2, 2): covariances of the points, which are added to the noise. None if the map is exact.
     """
     changes = np.zeros((1, len(PARAMETERS))) if parameters is None else parameters
     constants = np.broadcast_to(_constants(model, changes), (len(poses), TIME_OFFSET))

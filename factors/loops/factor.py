@@ -27,13 +27,14 @@ class LoopFactor:
     """A loop closure as a robust factor on two poses.
 
     ``measured`` (3,): the later pose in the frame of the earlier pose. None if only the positions are known to be
-    equal. ``sigmas``: standard deviations (3,) [m, m, rad] of the body-frame perturbation of ``measured``. If
-    ``measured`` is None, the standard deviation (1,) [m] of each coordinate of the difference of the positions.
+    equal.
+    ``sigmas``: standard deviations (3,) [m, m, rad] of the body-frame perturbation of ``measured``. If ``measured`` is
+    None, the standard deviation (1,) [m] of each coordinate of the difference of the positions.
     ``offset``: the motion from the later estimated pose to the pose at the time of the loop closure. Its covariance is
     added to the noise. None if both poses are equal. ``earlier_offset``: the same for the earlier pose.
     ``robust``: scale of the loss in standard deviations.
 
-    The methods take a list of two values: the later pose (3,) and the earlier pose (3,).
+    The methods take ``values``, a list of the later pose (3,) and the earlier pose (3,).
     """
 
     measured: Array | None
@@ -44,18 +45,19 @@ class LoopFactor:
 
     @property
     def rows(self) -> int:
-        """Number of residuals."""
+        """The number of residuals: 3, or 2 if only the positions are known to be equal."""
         return 2 if self.measured is None else 3
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """The whitened residual (2,) or (3,) with robust weights, and its Jacobian by each pose."""
+        """Return the whitened residual (2,) or (3,) with robust weight, and a list of its Jacobians by the later and
+        the earlier pose."""
         error, by_later, by_earlier = self.whitened(values)
         weight = math.sqrt(geman_mcclure_weight(float(error @ error), self.robust))
         return weight * error, [weight * by_later, weight * by_earlier]
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, Array, Array]:
-        """The whitened residual (2,) or (3,), its Jacobian by the later pose, and its Jacobian by the earlier pose,
-        without robust weights."""
+        """Return the whitened residual (2,) or (3,), its Jacobian by the later pose, and its Jacobian by the earlier
+        pose, without robust weights. ``values``: the later pose (3,) and the earlier pose (3,)."""
         moved = [None if o is None else o.delta for o in (self.offset, self.earlier_offset)]
         later, earlier = (v if o is None else se2.compose(v, o) for v, o in zip(values, moved, strict=True))
         if self.measured is not None:
@@ -73,22 +75,23 @@ class LoopFactor:
         return error, by_later, by_earlier
 
     def cost(self, values: Sequence[Array]) -> float:
-        """The robust loss."""
+        """Return the robust loss. ``values``: the later pose (3,) and the earlier pose (3,)."""
         error, _, _ = self.whitened(values)
         return float(geman_mcclure_loss(float(error @ error), self.robust))
 
     def widened(self, width: float) -> LoopFactor:
-        """The factor with the scale of its robust loss multiplied by ``width``."""
+        """Return the factor with the scale of its robust loss multiplied by ``width``."""
         return replace(self, robust=width * self.robust)
 
     def convex_width(self, values: Sequence[Array]) -> float:
-        """Return the smallest factor of at least 1 for :meth:`widened` that makes the loss convex at these values."""
+        """Return the smallest argument ``width`` of :meth:`widened`, at least 1, that makes the loss convex at these
+        ``values``."""
         error, _, _ = self.whitened(values)
         return max(1.0, math.sqrt(3.0) * float(np.linalg.norm(error)) / self.robust)
 
     @cached_property
     def _whitener(self) -> Array:
-        """The matrix that whitens the residual. If only positions are measured, the noise is isotropic."""
+        """Return the matrix that whitens the residual. If only positions are measured, the noise is isotropic."""
         covariances = [o.covariance for o in (self.offset, self.earlier_offset) if o is not None]
         if self.measured is None:
             added = sum(float(np.trace(covariance[:2, :2])) / 2.0 for covariance in covariances)
