@@ -86,8 +86,7 @@ def _inverted(block: Array, out: Array) -> bool:
 
 @compiled
 def _subtract(left: Array, right: Array, out: Array) -> None:
-    """Subtract the matrix product of the transpose of ``left`` (3, C) and ``right`` (3, D) from ``out`` (C, D), in
-    place."""
+    """Subtract the product of the transpose of ``left`` (3, C) and ``right`` (3, D) from ``out`` (C, D), in place."""
     for a in range(POSE):
         for j in range(left.shape[1]):
             for k in range(right.shape[1]):
@@ -125,8 +124,7 @@ def _eliminated(system: System, damping: float) -> tuple[bool, Array, Array, Arr
 
 @compiled
 def solved(system: System, damping: float) -> tuple[bool, Array, Array]:
-    """Solve the normal equations ``system`` for one damped step. The diagonal of the information is multiplied by ``1 +
-    damping``.
+    """Solve the normal equations ``system`` for one damped step. The diagonal is multiplied by ``1 + damping``.
 
     The results are True if the poses are determined, the step of the poses (N, 3), and the step of the parameters (P,).
     The steps are zero if the first value is False. Raises LinAlgError if the parameters are not determined.

@@ -99,6 +99,5 @@ class _Shared(FunctionCache):
 
 @cache
 def _locks(folder: str) -> int:
-    """Return the file descriptor of a folder's lock file. The file stays open, because closing it releases all
-    locks."""
+    """Return the file descriptor of a folder's lock file. It stays open, because closing it releases all locks."""
     return os.open(Path(folder) / "compiling.lock", os.O_RDWR | os.O_CREAT, 0o666)

@@ -98,8 +98,7 @@ def inverse(matrix: Array) -> Array:
 @compiled(error_model="numpy")
 def cholesky(covariance: Array) -> tuple[Array, bool]:
     """Return the lower Cholesky factor (D, D) of a covariance (D, D), and True if the covariance is positive definite.
-    If the second value is False, the first is undefined. The elements above the diagonal of the covariance are
-    ignored."""
+    If False, the factor is undefined. The elements above the diagonal of the covariance are ignored."""
     size = len(covariance)
     out = np.zeros((size, size))
     for i in range(size):
@@ -145,10 +144,8 @@ def invert_covariance(covariance: Array) -> Array:
 def predicted(covariance: Array, transition: Array, noise: Array) -> Array:
     """Predict a ``covariance`` (S, S) over one step. Returns ``F covariance F^T + Q`` (S, S).
 
-    ``transition`` (R, S): the first R rows of the transition matrix F. Its other S - R rows are those of an identity
-    matrix.
-    ``noise`` (R, R): the covariance Q of the process noise of the first R components. The other components have no
-    process noise.
+    ``transition`` (R, S): the first R rows of the transition matrix F. Its other rows are those of an identity.
+    ``noise`` (R, R): the covariance Q of the process noise of the first R components. The others have none.
     """
     rows, moved, out = len(transition), product(transition, covariance), covariance.copy()
     own = product_by_transpose(moved, transition)

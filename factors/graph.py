@@ -88,7 +88,7 @@ def is_place(key: int) -> bool:
 
 
 def is_of_keyframe(key: int) -> bool:
-    """True if ``key`` is the key of a pose or of roll and pitch. A fixed-lag smoother removes these together with their
+    """True if ``key`` is the key of a pose, or of roll and pitch. A fixed-lag smoother removes these with their
     keyframe."""
     return key >> _CHARACTER in (_POSE, _TILT)
 
@@ -234,8 +234,7 @@ class VectorPriorFactor:
         self._whitener = np.diag(1.0 / uncertainty) if uncertainty.ndim == 1 else positive.whitener(uncertainty)
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Return the whitened residual (P,) and a list of one Jacobian (P, P). ``values``: a list of the vector
-        (P,)."""
+        """Return the whitened residual (P,) and a list of one Jacobian (P, P)."""
         return self._whitener @ (values[0] - self._mean), [self._whitener]
 
     def cost(self, values: Sequence[Array]) -> float:
@@ -283,9 +282,9 @@ def retract(key: int, value: Array, step: Array) -> Array:
 def frame_motions(values: Values) -> tuple[Array, list[int]]:
     """Return how all variables change when the whole solution moves in the world frame (the gauge freedom).
 
-    The first result (n, 3) stacks the changes of all variables, in the tangent space of each. Its columns belong to a
-    shift in x, a shift in y, and a rotation about the origin. The second result has, for each variable, the index after
-    its last row.
+    The first result (n, 3) stacks the changes of all variables, in the tangent space of each. Its columns belong to
+    shifts in x and y, and a rotation about the origin. The second result has the index after the last row of each
+    variable.
     """
     parts = []
     for key, value in values.items():

@@ -17,8 +17,7 @@ class Increment:
     """The relative motion of the robot between two times.
 
     ``delta`` (3,): the pose at the end in the frame of the pose at the start. ``covariance`` (3, 3): the covariance of
-    ``delta`` in the frame of the end. ``duration`` [s]: end minus start. ``still`` [s]: the part of the duration at
-    rest.
+    ``delta`` in the frame of the end. ``duration`` [s]: end minus start. ``still`` [s]: the time at rest.
     """
 
     delta: Array
@@ -51,8 +50,7 @@ class ChainState(NamedTuple):
 
 
 def propagate(covariance: Array, increment: Increment) -> Array:
-    """Return the body-frame covariance (3, 3) of a pose after the motion ``increment``. ``covariance`` (3, 3): before
-    the motion."""
+    """Return the body-frame covariance (3, 3) of a pose after the motion ``increment``, from the one before it."""
     return np.asarray(carried(covariance, increment.delta, increment.covariance))
 
 
@@ -69,8 +67,8 @@ def poses_between(
     poses: Array,
     covariances: Array,
 ) -> tuple[Array, Array]:
-    """Interpolate M estimated poses to T times with the odometry. Returns poses (T, 3), and covariances (T, 3, 3) in
-    the body frame.
+    """Interpolate M estimated poses to T times with the odometry. Returns poses (T, 3) and body-frame covariances (T,
+    3, 3).
 
     ``previous`` (T,): the index of the last estimated pose before each of the T times.
     ``deltas`` (T, 3), ``noises`` (T, 3, 3), ``durations`` (T,) [s]: the odometry's motion from that pose to the time,

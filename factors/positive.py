@@ -21,8 +21,8 @@ SKEW = 1e-6  # largest asymmetry of a correlation matrix that counts as a roundi
 
 
 def nearest(covariances: Array) -> Array:
-    """The nearest symmetric, invertible covariances (..., D, D). Raises LinAlgError if a variance is not positive, or
-    if an element is not finite."""
+    """Return the nearest symmetric, invertible covariances (..., D, D). Raises LinAlgError if a variance is not
+    positive, or if an element is not finite."""
     sigmas, values, vectors = _parts(covariances)
     shares = (vectors * values[..., None, :]) @ np.swapaxes(vectors, -1, -2)
     shares = (shares + np.swapaxes(shares, -1, -2)) / 2.0
@@ -30,7 +30,7 @@ def nearest(covariances: Array) -> Array:
 
 
 def sound(covariance: Array) -> Array:
-    """Return the covariance (D, D) unchanged if it is numerically invertible, otherwise the :func:`nearest` invertible one."""
+    """Return the covariance (D, D) if it is numerically invertible, otherwise the :func:`nearest` invertible one."""
     if is_clear(covariance):
         return covariance
     sigmas = np.sqrt(np.maximum(np.diag(covariance), 0.0))
@@ -42,8 +42,8 @@ def sound(covariance: Array) -> Array:
 
 @compiled(error_model="numpy")
 def is_clear(covariance: Array) -> bool:
-    """True if a covariance (D, D) is finite, symmetric and far from singular. This test is faster than :func:`sound`,
-    which then returns the covariance unchanged."""
+    """True if a covariance (D, D) is finite, symmetric and far from singular. It is a fast test. If it is False,
+    :func:`sound` decides whether the covariance is invertible."""
     size, shares = len(covariance), np.empty(covariance.shape)
     for i in range(size):
         if not 0.0 < covariance[i, i] < np.inf:
@@ -71,7 +71,7 @@ def whitener(covariances: Array) -> Array:
 
 
 def root(covariances: Array) -> Array:
-    """The lower Cholesky roots of covariances (..., D, D), or of the :func:`nearest` covariances if a root does not exist."""
+    """Return lower Cholesky factors (..., D, D) of covariances, or of the :func:`nearest` ones if they do not exist."""
     try:
         return np.asarray(np.linalg.cholesky(covariances))
     except np.linalg.LinAlgError:
@@ -88,7 +88,7 @@ def solve(covariances: Array, right: Array) -> Array:
 
 
 def inverse(covariances: Array) -> Array:
-    """The inverses of covariances (..., D, D). Small eigenvalues are raised first if a covariance is numerically singular."""
+    """Return the inverses of covariances (..., D, D). Small eigenvalues of a singular covariance are raised first."""
     try:
         inverses = np.asarray(np.linalg.inv(covariances), dtype=float)
         if np.all(np.diagonal(inverses, axis1=-2, axis2=-1) > 0.0):
@@ -100,13 +100,14 @@ def inverse(covariances: Array) -> Array:
 
 
 def squared(errors: Array, covariances: Array) -> Array:
-    """The squared Mahalanobis distances (...) of ``errors`` (..., D) with covariances (..., D, D)."""
+    """Return the squared Mahalanobis distances (...) of ``errors`` (..., D) with covariances (..., D, D)."""
     return np.asarray(np.sum(errors * solve(covariances, errors[..., None])[..., 0], axis=-1))
 
 
 def smoothed(covariance: Array, transition: Array, noise: Array, change: Array, later: Array) -> tuple[Array, Array]:
-    """Compute :func:`factors.gaussian.smoothed` also for nearly singular covariances. If that function fails, the
-    smoothed covariance is computed in Joseph's form, which is positive semi-definite for any gain."""
+    """Run one backward step of the smoother of Rauch, Tung and Striebel, also for nearly singular covariances.
+    Arguments and results are those of :func:`factors.gaussian.smoothed`. If that function fails, the smoothed
+    covariance is computed in Joseph's form, which is positive semi-definite for any gain."""
     arrays = (np.ascontiguousarray(part, dtype=float) for part in (covariance, transition, noise, change, later))
     try:
         correction, smoothed_covariance = gaussian.smoothed(*arrays)
@@ -123,7 +124,7 @@ def smoothed(covariance: Array, transition: Array, noise: Array, change: Array, 
 
 
 def worst_sigma(covariances: Array) -> Array:
-    """The largest standard deviation (...,) of covariances (..., D, D) over all directions."""
+    """Return the largest standard deviation (...) of each covariance (..., D, D) over all directions."""
     return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(covariances)[..., -1], 0.0)))
 
 

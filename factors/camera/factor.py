@@ -31,14 +31,12 @@ NOT_MOVED, NO_SPREAD, EXACT = np.zeros(3), np.zeros((3, 3)), np.empty((0, 3, 3))
 
 @dataclass(frozen=True, slots=True)
 class ReprojectionFactor:
-    """A factor on the robot's pose from K known points in one image. The pose may be the pose at a slightly earlier
-    time.
+    """A factor on the robot's pose from K known points in one image, taken at the time of the pose or shortly later.
 
     ``model``: the camera. ``points`` (K, 3) [m]: world positions. ``pixels`` (K, 2): their measured pixels.
     ``offset`` (3,): the robot's pose at the time of the image in the frame of the estimated pose, from odometry. None
     if the two poses are equal. ``offset_covariance`` (3, 3): its body-frame covariance, which is added to the noise.
-    ``point_covariances`` (K, 3, 3): covariances of the points, which are added to the noise. None if the points are
-    exact.
+    ``point_covariances`` (K, 3, 3): covariances of the points, which are added to the noise. None if exact.
     ``estimated``: indices in :data:`PARAMETERS` of the P camera constants that are estimated.
     ``moved_by`` (K,): for each point, the index of the estimated displacement that is added to the point, or -1. Empty
     if no displacement is estimated. ``twist`` (3,): the robot's body-frame velocity at the time of the image. Required
@@ -83,8 +81,7 @@ class ReprojectionFactor:
         )
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Return the whitened residual (2K,) of K pixels and a list of its Jacobians (2K, d), one for each variable of
-        size d.
+        """Return the whitened residual (2K,) of K pixels and its Jacobian (2K, d) by each variable of size d.
         ``values``: the variables, as in the class docstring. Residual and Jacobians include robust weights and
         tempering. Their noise includes the variances of the robot's roll and pitch."""
         if self.of_pose_alone:
@@ -104,8 +101,7 @@ class ReprojectionFactor:
         return self.model.tempering * float(loss)
 
     def levelled(self, values: Sequence[Array]) -> tuple[Array, Array]:
-        """Fit the robot's roll and pitch to the K pixels of the image. ``values``: the variables, as in the class
-        docstring.
+        """Fit roll and pitch to the K pixels of the image. ``values``: the variables, as in the class docstring.
         Returns the whitened residual (K, 2) after the fit, and roll and pitch (2,) in units of their prior standard
         deviation."""
         error, (*_, by_tilt) = self.whitened(values)

@@ -163,8 +163,7 @@ def undistorted(k: Lens, distorted: Array) -> tuple[Array, Array]:
 
 @compiled(error_model="numpy")
 def project(k: Lens, points: Array) -> tuple[Array, Array]:
-    """Return the pixels (K, 2) of points (K, 3) in the camera frame, and their Jacobians (K, 2, 3) by the points.
-    ``k``: the lens."""
+    """Return the pixels (K, 2) of points (K, 3) in the camera frame, and their Jacobians (K, 2, 3) by the points."""
     n = len(points)
     pixels, jacobians = np.empty((n, 2)), np.empty((n, 2, 3))
     for i in range(n):
@@ -265,8 +264,7 @@ def linearize(camera: tuple[Lens, Array, Array], pose: Array, points: Array) -> 
 
 @compiled(error_model="numpy")
 def turned(roll: float, pitch: float) -> Array:
-    """Return the rotation matrix (3, 3) of a robot with roll and pitch, the exponential of the rotation vector (roll,
-    pitch, 0) [rad]."""
+    """Return the rotation (3, 3) of a tilted robot: the exponential of the rotation vector (roll, pitch, 0) [rad]."""
     angle = math.sqrt(roll * roll + pitch * pitch)
     a, b = (math.sin(angle) / angle, (1.0 - math.cos(angle)) / (angle * angle)) if angle > 1e-6 else (1.0, 0.5)
     turn = np.empty((3, 3))
@@ -316,8 +314,7 @@ def linearize_one(
     residual: Array,
     jacobian: Array,
 ) -> float:
-    """Linearise the reprojection error of one pixel, as :func:`whiten` does for many. ``camera``: lens, position and
-    rotation.
+    """Linearise the reprojection error of one pixel, as :func:`whiten` does. ``camera``: lens, position, rotation.
     ``at``: pose, tilt, point and measured pixel. Writes the whitened ``residual`` (2,) and ``jacobian`` (2, WIDTH).
     Returns the squared norm of the residual without robust weight."""
     pose, tilt, point, measured = at

@@ -92,8 +92,7 @@ class CameraModel:
         return gtsam.Cal3DS2(self.fx, self.fy, 0.0, self.cx, self.cy, *self.distortion)
 
     def contains(self, pixels: Array, margin: float = 0.0) -> Any:
-        """Return a mask (...) of the ``pixels`` (..., 2) that are in the image, or at most ``margin`` pixels outside of
-        it."""
+        """Return a mask (...) of ``pixels`` (..., 2) in the image, or at most ``margin`` pixels outside of it."""
         u, v = pixels[..., 0], pixels[..., 1]
         inside = (u >= -0.5 - margin) & (u <= self.width - 0.5 + margin)
         return inside & (v >= -0.5 - margin) & (v <= self.height - 0.5 + margin)
@@ -109,7 +108,7 @@ def mounting(roll: float, pitch: float, yaw: float) -> Array:
 
 
 def angles_of_camera(rotation: Array) -> tuple[float, float, float]:
-    """Return the roll, pitch and yaw [rad] of a camera with ``rotation`` (3, 3) in the robot frame. The inverse of
+    """Return the roll, pitch and yaw [rad] of a camera with ``rotation`` (3, 3) in the robot frame. Inverts
     :func:`mounting`."""
     roll, pitch, yaw = gtsam.Rot3(rotation @ FORWARD.T).xyz().tolist()
     return roll, pitch, yaw
@@ -168,8 +167,7 @@ def carrier(model: CameraModel, position: Array, rotation: Array) -> tuple[Array
 def camera_pose(model: CameraModel, pose: Array, tilt: Array | None = None) -> tuple[Array, Array]:
     """Return the camera's position (3,) and rotation (3, 3) in the world, from the robot's planar ``pose`` (3,).
 
-    ``tilt`` (2,) [rad]: roll and pitch of the robot, a rotation vector along its own x and y axes. None for a level
-    robot.
+    ``tilt`` (2,) [rad]: the robot's roll and pitch, a rotation vector along its x and y axes. None for a level robot.
     """
     c, s = math.cos(pose[2]), math.sin(pose[2])
     turn = np.array(((c, -s, 0.0), (s, c, 0.0), (0.0, 0.0, 1.0)))
@@ -198,8 +196,7 @@ def rays(model: CameraModel, pixels: Array) -> Array:
 
 
 def folded(model: CameraModel) -> Array | None:
-    """Return one pixel (2,) at which the lens model is not invertible, or None if no pixel of a grid over the image is
-    such.
+    """Return a pixel (2,) at which the lens model is not invertible, or None. Checks a grid of pixels over the image.
 
     A lens is invertible at a pixel if a direction within the valid radius projects to the pixel, with a positive
     determinant of the lens's Jacobian.
@@ -368,8 +365,7 @@ def _normalised(log: Array) -> Array:
 
 @compiled(error_model="numpy")
 def _scale(weights: Array) -> float:
-    """Return the geometric mean of :data:`SCALES` with these ``weights``. An arithmetic mean would depend mostly on the
-    largest values."""
+    """Return the weighted geometric mean of :data:`SCALES`. An arithmetic mean would depend mostly on large values."""
     total = 0.0
     for i, scale in enumerate(SCALES):
         total += weights[i] * math.log(scale)

@@ -119,8 +119,8 @@ class PointPrior:
 
     @classmethod
     def of(cls, pose: Array, point: Array, sigma: float) -> PointPrior:
-        """Return the prior of a world ``point`` (3,) with the standard deviation ``sigma`` [m] relative to a robot at
-        ``pose`` (3,)."""
+        """Return the prior of a world ``point`` (3,), with standard deviation ``sigma`` [m], for a robot at ``pose``
+        (3,)."""
         return cls(_from_robot(pose, point), sigma)
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
@@ -133,8 +133,7 @@ class PointPrior:
         return (relative - self.mean) / self.sigma, [by_pose / self.sigma, by_point / self.sigma]
 
     def cost(self, values: Sequence[Array]) -> float:
-        """Return half the squared norm of the whitened residual. ``values``: the robot's pose (3,) and the point
-        (3,)."""
+        """Return half the squared norm of the whitened residual."""
         residual = (_from_robot(*values) - self.mean) / self.sigma
         return 0.5 * float(residual @ residual)
 

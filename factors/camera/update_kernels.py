@@ -188,8 +188,7 @@ def marginal(residual: Array, jacobian: Array, robust: float, tempering: float) 
 @compiled(error_model="numpy")
 def leaning(image: PackedImage, pose: Array, covariance: Array) -> tuple[Array, Array]:
     """Estimate the robot's roll and pitch from one image, by least squares. ``pose`` (3,), ``covariance`` (3, 3): the
-    predicted robot pose and its body-frame covariance. Returns roll and pitch (2,) [rad] and their covariance (2,
-    2)."""
+    prediction of the robot pose. Returns roll and pitch (2,) [rad] and their covariance (2, 2)."""
     residual, jacobian = whitened(image, pose)
     prior = np.eye(POINT)
     put(inverse(covariance), prior)

@@ -41,16 +41,14 @@ LEAST_SINGULAR = 1e-6  # minimum singular value of a Jacobian by a landmark, in 
 
 @dataclass(frozen=True, slots=True)
 class BearingRangeFactor:
-    """A factor on the robot's pose from K landmarks measured at one time. The pose may be the pose at a slightly
-    earlier time.
+    """A factor on the robot's pose from K landmarks measured at one time, or shortly after the time of the pose.
 
     ``points``: world positions (K, 2) of the landmarks, or (K, 3) with their heights above the sensor.
     ``ranges``, ``bearings``: measurements (K,) [m, rad], NaN where a value is missing.
     ``offset`` (3,): the robot's pose at the time of the measurement in the frame of the estimated pose, from odometry.
     None if the two poses are equal.
     ``offset_covariance`` (3, 3): body-frame covariance of ``offset``. It is added to the noise.
-    ``point_covariances`` (K, 2, 2): covariances of the landmarks, which are added to the noise. None if the map is
-    exact.
+    ``point_covariances`` (K, 2, 2): covariances of the landmarks, which are added to the noise. None if exact.
     ``estimated``: indices in :data:`PARAMETERS` of the P sensor constants that are estimated.
     ``free``: True if the position of the landmark is estimated. Then K is 1, and the estimate replaces ``points``.
     ``biased``: True if a bias of the ranges is estimated.
@@ -229,8 +227,7 @@ class BearingRangeFactor:
         )
 
     def _placed(self, point: Array) -> Array:
-        """Return the landmark's ``point`` (2,) as an array (1, 2), or (1, 3) with its height if ``points`` has
-        heights."""
+        """Return the landmark's ``point`` (2,) as (1, 2), or as (1, 3) with its height if ``points`` has heights."""
         return np.concatenate((np.reshape(point, (1, 2)), self.points[:1, HEIGHT:]), axis=1)
 
     def dof(self) -> int:
@@ -258,8 +255,7 @@ class BearingRangeFactor:
 @dataclass(frozen=True)
 class ResolvedFactor:
     """A landmark ``factor`` for one Kalman update, with Gaussian measurements in place of ranges that may be too long.
-    ``shift`` (K,): is added to the whitened range residuals. ``root`` (K,): the square roots of the measurements'
-    weights."""
+    ``shift`` (K,): is added to the whitened range residuals. ``root`` (K,): the square roots of the weights."""
 
     factor: BearingRangeFactor
     shift: Array
@@ -309,8 +305,7 @@ def landmark_update(
 
 
 class BearingRangeStack:
-    """Several landmark factors with the same model and the same estimated constants, linearised together. No landmark
-    is free.
+    """Several landmark factors with the same model and estimated constants, linearised together. No landmark is free.
 
     ``factors``: L factors.
     ``pose_of`` (L,): the index of the pose that each factor depends on.

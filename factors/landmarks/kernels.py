@@ -43,8 +43,7 @@ def linearize(model: Array, pose: Array, changes: Array, packed: Sighting, error
     robot pose.
     ``changes`` (6,): corrections of the sensor constants. ``packed``: the measurement as a tuple, see :data:`Sighting`.
     ``error`` (K, 2): output, the whitened residual. Must contain zeros before the call.
-    ``jacobian`` (K, 2, WIDTH): output, its Jacobian by pose, landmark and constants. Must contain zeros before the
-    call.
+    ``jacobian`` (K, 2, WIDTH): output, its Jacobian. Must contain zeros before the call.
     """
     points, ranges, bearings, displaced, offset, widened, covariance, count, moves, twist, surveys = packed
     x, y, turned = offset[0], offset[1], offset[2]
@@ -108,8 +107,8 @@ def linearize_each(model: Array, poses: Array, points: Array, ranges: Array, bea
 
 @compiled
 def _widen(error: Array, jacobian: Array, uu: float, uv: float, vv: float) -> None:
-    """Whiten the ``error`` (2,) of a landmark and its ``jacobian`` (2, WIDTH) by the covariance [[uu, uv], [uv, vv]],
-    in place."""
+    """Whiten the ``error`` (2,) and ``jacobian`` (2, WIDTH) of a landmark by a covariance [[uu, uv], [uv, vv]], in
+    place."""
     # [[p, 0], [r, q]] is the inverse of the lower Cholesky root of the covariance
     p = 1.0 / math.sqrt(uu)
     low = uv * p
@@ -207,8 +206,8 @@ def updated(
     ``model`` (14,): the array ``packed`` of a :class:`~factors.landmarks.model.BearingRangeModel`. ``packed``: the
     measurement, see :data:`Sighting`. ``pose`` (3,), ``covariance`` (S, S): the prediction. The first three components
     of the error state are the pose.
-    ``values`` (P,): corrections of the estimated sensor constants at the prediction.
-    ``indices`` (P,): the indices of these constants in :data:`~factors.landmarks.model.PARAMETERS`.
+    ``values`` (P,), ``indices`` (P,): corrections of the estimated sensor constants, and their indices in
+    :data:`~factors.landmarks.model.PARAMETERS`.
     ``first``: the index of the first of these constants in the error state.
     ``gate``: the noise of a landmark is increased if its normalised innovation squared exceeds this limit.
     Returns the correction (S,), the corrected covariance (S, S), the whitened residuals (K, 2) of the prediction, the

@@ -38,9 +38,8 @@ LEAST_INFORMATION = 0.2
 
 
 class LateRanges(NamedTuple):
-    """The statistics of late ranges. These are ranges that are too long, because the signal was reflected. ``share``:
-    the fraction of ranges that are late. ``mean``, ``sigma`` [m]: mean and standard deviation of the excess of a late
-    range."""
+    """The statistics of late ranges, which are too long because the signal was reflected. ``share``: the fraction of
+    ranges that are late. ``mean``, ``sigma`` [m]: mean and standard deviation of the excess of a late range."""
 
     share: float = 0.0
     mean: float = 0.0
@@ -54,8 +53,8 @@ NONE = LateRanges()
 def mixture(
     error: float, slope: float, robust: float, share: float, mean: float, sigma: float
 ) -> tuple[float, float, float]:
-    """Return the negative log-likelihood of a range that may be late, its derivative by ``error``, and the Fisher
-    information about ``error``. A late range is too long, because the signal was reflected.
+    """Return the negative log-likelihood of a range that may be late (too long), its derivative by ``error``, and its
+    Fisher information about ``error``.
 
     ``error``: the predicted minus the measured range in standard deviations.
     ``slope``: the inverse of the standard deviation of a range [1/m].
@@ -152,8 +151,7 @@ class LateShares:
         object.__setattr__(self, "expected", self._expected())
 
     def _expected(self) -> LateRanges:
-        """Return the share of late ranges, and mean and standard deviation of their excess, averaged over all
-        hypotheses."""
+        """Return the share of late ranges, and the moments of their excess, averaged over all hypotheses."""
         if self.probability == 0.0:
             return NONE
         logs = _prior(self.probability) if self.log_weights is None else self.log_weights

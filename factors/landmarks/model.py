@@ -67,8 +67,7 @@ class BearingRangeModel:
 
 
 def predict(model: BearingRangeModel, poses: Array, points: Array) -> tuple[Array, Array]:
-    """Return the predicted ranges [m] and bearings [rad], two arrays (...), of ``points`` from robot ``poses`` (...,
-    3).
+    """Predict the ranges (...) [m] and bearings (...) [rad] of ``points`` from robot ``poses`` (..., 3).
 
     ``points``: world positions (..., 2), or (..., 3) with the height above the sensor as third coordinate.
     """
@@ -93,8 +92,7 @@ def on_floor(model: BearingRangeModel, points: Array, ranges: Array) -> Array:
 
 
 def located(model: BearingRangeModel, ranges: Array, bearings: Array) -> Array:
-    """Return the positions (K, 2) [m] in the robot frame of landmarks with measured ranges (K,) [m] and bearings (K,)
-    [rad]."""
+    """Return the positions (K, 2) of landmarks in the robot frame, from ranges (K,) [m] and bearings (K,) [rad]."""
     direction = bearings - model.bearing_bias
     distance = ranges / model.range_scale
     if model.depth:
@@ -104,8 +102,8 @@ def located(model: BearingRangeModel, ranges: Array, bearings: Array) -> Array:
 
 
 def sigmas(model: BearingRangeModel, ranges: Array) -> Array:
-    """Return the standard deviations (K, 2) [m, rad] of range and bearing at measured ``ranges`` (K,). A missing range
-    (NaN) counts as 0 m."""
+    """Return the standard deviations (K, 2) [m, rad] of range and bearing at measured ``ranges`` (K,). NaN counts as 0
+    m."""
     ranges = np.where(np.isnan(ranges), 0.0, ranges)
     out = np.empty((len(ranges), 2))
     out[:, 0] = np.hypot(model.range_sigma, model.range_sigma_relative * ranges)
@@ -115,8 +113,7 @@ def sigmas(model: BearingRangeModel, ranges: Array) -> Array:
 
 def residuals(model: BearingRangeModel, poses: Array, points: Array, ranges: Array, bearings: Array) -> Array:
     """Return the whitened residuals (..., K, 2) of range and bearing to K points (K, 2), predicted minus measured.
-    ``poses``: (..., 1, 3) or (3,). ``ranges``, ``bearings`` (K,): measured. A residual is zero if the measurement is
-    NaN (missing)."""
+    ``poses``: (..., 1, 3) or (3,). ``ranges``, ``bearings`` (K,): measured. It is zero if they are NaN."""
     expected_range, expected_bearing = predict(model, poses, points)
     sigma = sigmas(model, ranges)
     error = np.empty((*np.shape(expected_range), 2))
@@ -158,7 +155,7 @@ def with_late(model: BearingRangeModel, late: LateRanges) -> BearingRangeModel:
 
 
 def _constants(model: BearingRangeModel, parameters: Array) -> Array:
-    """Return the constants (..., 5) of a model with corrections ``parameters`` (..., 6), in the order of
+    """Return the constants (..., 5) of a model after corrections ``parameters`` (..., 6), ordered as
     :data:`PARAMETERS`."""
     x, y, _ = model.mounting
     out: Array = (
@@ -240,8 +237,7 @@ def _whitened(
     of the sensor in the robot frame. ``ahead_x``, ``ahead_y``: unit vector of the depth axis in the robot frame.
 
     The results are the errors of range and bearing, the point's distance along the floor, the derivatives of the
-    unscaled range by ``sx`` and ``sy``, the unscaled range, and the range's inverse standard deviation. Missing values
-    are zero.
+    unscaled range by ``sx`` and ``sy``, the unscaled range, and the range's inverse standard deviation.
     """
     range_scale, range_sigma, range_sigma_relative, bearing_bias, bearing_sigma = model
     range_error, bearing_error, weight = 0.0, 0.0, 0.0
@@ -274,8 +270,7 @@ def log_likelihood(
 ) -> Array:
     """Return the log-likelihood (N,), up to a constant, of K landmark measurements at ``poses`` (N, 3).
 
-    ``points``: world positions (K, 2), or (K, 3) with heights above the sensor. ``ranges``, ``bearings`` (K,): NaN
-    where missing.
+    ``points``: world positions (K, 2), or (K, 3) with heights. ``ranges``, ``bearings`` (K,): NaN where missing.
     ``parameters`` (N, 6): corrections of :data:`PARAMETERS` for each pose, as in :func:`recalibrated`.
     ``point_covariances`` (K, 2, 2): covariances of the points, which are added to the noise. None if the map is exact.
     """

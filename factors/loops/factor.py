@@ -26,8 +26,7 @@ from factors.se2 import Array
 class LoopFactor:
     """A loop closure as a robust factor on two poses.
 
-    ``measured`` (3,): the later pose in the frame of the earlier pose. None if only the positions are known to be
-    equal.
+    ``measured`` (3,): the later pose in the frame of the earlier pose. None if only the positions are equal.
     ``sigmas``: standard deviations (3,) [m, m, rad] of the body-frame perturbation of ``measured``. If ``measured`` is
     None, the standard deviation (1,) [m] of each coordinate of the difference of the positions.
     ``offset``: the motion from the later estimated pose to the pose at the time of the loop closure. Its covariance is
@@ -49,8 +48,8 @@ class LoopFactor:
         return 2 if self.measured is None else 3
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Return the whitened residual (2,) or (3,) with robust weight, and a list of its Jacobians by the later and
-        the earlier pose."""
+        """Return the whitened residual (2,) or (3,) with robust weight, and its Jacobians by the later and earlier
+        pose."""
         error, by_later, by_earlier = self.whitened(values)
         weight = math.sqrt(geman_mcclure_weight(float(error @ error), self.robust))
         return weight * error, [weight * by_later, weight * by_earlier]
@@ -84,7 +83,7 @@ class LoopFactor:
         return replace(self, robust=width * self.robust)
 
     def convex_width(self, values: Sequence[Array]) -> float:
-        """Return the smallest argument ``width`` of :meth:`widened`, at least 1, that makes the loss convex at these
+        """Return the smallest ``width`` of :meth:`widened`, at least 1, that makes the loss convex at these
         ``values``."""
         error, _, _ = self.whitened(values)
         return max(1.0, math.sqrt(3.0) * float(np.linalg.norm(error)) / self.robust)

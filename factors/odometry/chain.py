@@ -53,15 +53,15 @@ TWIST_TIME = 0.1  # s; a velocity is the mean over this time
 class OdometryChain:
     """The integrated odometry of a run. Add rows (odometry measurements), then ask for states and motions at any time.
 
-    Rows may arrive late. The integrated states at the later rows (knots) are then computed again. After the last row,
-    the robot is assumed to continue with its velocity.
+    Rows may arrive late. The integrated states at the later rows are then computed again. After the last row, the robot
+    is assumed to continue with its velocity.
 
     ``model``: the odometry's constants and noise.
     ``use_gyro``: True if gyro rows replace the rotation of the wheels.
     ``horizon`` [s]: rows that are this much older than the newest row may be deleted. New rows before the oldest
     remaining row are rejected.
     ``estimated``: indices in :data:`~factors.odometry.model.PARAMETERS` of the P constants that the estimator
-    estimates. Methods with ``constants`` (P,) correct motions for changes of these.
+    estimates. Methods with ``constants`` (P,), the corrections of these, correct motions accordingly.
     """
 
     def __init__(
@@ -117,7 +117,8 @@ class OdometryChain:
         return self._insert(t, GYRO, w, 0.0, 0.0, 0.0)
 
     def add_velocities(self, t: Array, v: Array, w: Array) -> int:
-        """Add N rows as :meth:`add_velocity` does, in order of time. Returns the number of rows that are not too old."""
+        """Add N rows (N,) as :meth:`add_velocity` does, in order of time. Returns the number of rows that were
+        added."""
         if not len(t):
             return 0
         self._reserve(len(t))
@@ -144,23 +145,22 @@ class OdometryChain:
         self._now_has(count, forgets=count < end)
 
     def state(self, t: float) -> ChainState:
-        """The integrated state at time ``t`` [s]. Before the first row the pose is constant and the motion counts as
-        unknown. Raises ValueError if the rows of that time are deleted."""
+        """Return the integrated state at time ``t`` [s]. Before the first row the pose is constant and the motion
+        counts as unknown. Raises ValueError if the rows of that time are deleted."""
         if t < self.begin:
             raise ValueError(f"the odometry at {t:.3f} s was deleted, and is available only from {self.begin:.3f} s on")
         return ChainState(*state_at(self._knots, self._count, t, self._constants))
 
     def states(self, t: Array) -> Array:
-        """The integrated states (M, 8) at times (M,) [s]. The columns are the fields of :class:`ChainState`."""
+        """Return the integrated states (M, 8) at times (M,) [s]. The columns are the fields of :class:`ChainState`."""
         out = np.empty((len(t), STATE))
         states_at(self._knots, self._count, np.asarray(t, dtype=float), self._constants, out)
         return out
 
     def begin_slip(self, since: float) -> None:
-        """Report that the wheels slip since the time ``since`` [s]. The motion is unknown from then until :meth:`end_slip`.
+        """Report that the wheels slip since ``since`` [s]. The motion is unknown from then until :meth:`end_slip`.
 
-        If a row from before ``since`` arrives later, all later states are integrated again. The motion between
-        ``since`` and the newest row then counts as known again.
+        Limitation: a row that is added later and is older than the newest row changes the time of unknown motion.
         """
         if not self._constants[SLIPPING] and self._count:
             self._knots[self._count - 1, UNKNOWN] += max(0.0, self._knots[self._count - 1, T] - since)
@@ -176,20 +176,20 @@ class OdometryChain:
         return bool(self._constants[SLIPPING])
 
     def relative(self, start: ChainState, end: ChainState) -> Increment:
-        """The motion from ``start`` to ``end``, two results of :meth:`state`. A row before ``start`` that is added
-        between the two calls of :meth:`state` also changes this motion."""
+        """Return the motion from ``start`` to ``end``, two results of :meth:`state`. Limitation: the motion is wrong if
+        a row older than ``start`` was added between the two calls of :meth:`state`."""
         return Increment(*relative(self._noise, tuple(start), tuple(end)))
 
     def travelled(self, start: ChainState, t: float) -> tuple[ChainState, Increment]:
-        """The integrated state at ``t`` [s] and the motion from ``start`` to this state: :meth:`state` and
-        :meth:`relative` in one call."""
+        """Return the integrated state at ``t`` [s], and the motion from ``start`` to this state. This is :meth:`state`
+        and :meth:`relative` in one call."""
         known = self._knots, self._count, self._constants, self._noise
         end, delta, covariance, duration, still = travelled(*known, tuple(start), t)
         return ChainState(*end), Increment(delta, covariance, duration, still)
 
     def twist(self, t: float) -> Array:
-        """The robot's mean velocity (3,) in the :data:`TWIST_TIME` before ``t``, in the robot frame [m/s, m/s, rad/s].
-        Raises ValueError if the rows of that time are deleted."""
+        """Return the robot's mean velocity (3,) in the last :data:`TWIST_TIME` seconds before ``t``, in the robot frame
+        [m/s, m/s, rad/s]. Raises ValueError if the rows of that time are deleted."""
         if t - TWIST_TIME < self.begin:
             needed = f"the velocity at {t:.3f} s needs odometry from {t - TWIST_TIME:.3f} s on"
             raise ValueError(f"{needed}, but the odometry before {self.begin:.3f} s was deleted")
@@ -227,12 +227,12 @@ class OdometryChain:
     def moved(
         self, start: ChainState, times: Sequence[float], pose: Array, covariance: Array, constants: Array
     ) -> tuple[Array, Array, Array, Array]:
-        """Predict a pose (3,) with body-frame ``covariance`` (3, 3) from the odometry state ``start`` to each of K
-        ``times`` [s].
+        """Predict a pose (3,) with body-frame ``covariance`` (3, 3) from the odometry state ``start`` to K ``times``
+        [s].
 
-        ``constants`` (P,): corrections of the estimated odometry constants. Returns the odometry states (K, 8), the
-        poses (K, 3), their body-frame covariances (K, 3, 3), and their covariances (K, 3, 3) of (x, y, heading) in the
-        world frame.
+        ``constants`` (P,): corrections of the estimated odometry constants. Returns the odometry states (K, 8) with the
+        fields of :class:`ChainState`, the poses (K, 3), their body-frame covariances (K, 3, 3), and their covariances
+        (K, 3, 3) of (x, y, heading) in the world frame.
         """
         count = len(times)
         states, poses = np.empty((count, STATE)), np.empty((count, 3))
@@ -244,19 +244,19 @@ class OdometryChain:
         return out
 
     def relatives(self, starts: Array, ends: Array, constants: Array) -> tuple[Array, Array]:
-        """The motions from ``starts`` to ``ends``, N states (N, 8) each from :meth:`states`. ``constants`` (P,):
-        corrections of the estimated odometry constants. Returns relative poses (N, 3) and covariances (N, 3, 3)."""
+        """Return the N motions from ``starts`` to ``ends``, states (N, 8) each from :meth:`states`, as relative poses
+        (N, 3) and covariances (N, 3, 3). ``constants`` (P,): corrections of the estimated odometry constants."""
         deltas, covariances = relatives(self._noise, starts, ends, constants, self._indices)
         return deltas, covariances
 
     def factor(self, increment: Increment, *, scale_known: bool) -> OdometryFactor:
-        """An increment as a factor on two poses and on the estimated odometry constants. ``scale_known``: True if
-        measurements other than odometry determine the scale of the map."""
+        """Return a factor of the motion ``increment`` on two poses and on the estimated odometry constants.
+        ``scale_known``: True if measurements other than odometry determine the scale of the map."""
         kind = OdometryFactor if scale_known else ScaleFreeOdometryFactor
         return kind(increment, self._estimated)
 
     def exact_factor(self, increment: Increment) -> OdometryFactor:
-        """An increment as a factor on two poses only, with the odometry constants of the model."""
+        """Return a factor of the motion ``increment`` on two poses only, with the odometry constants of the model."""
         return OdometryFactor(increment)
 
     def _insert(self, t: float, kind: float, a: float, b: float, c: float, unknown: float) -> bool:
@@ -298,7 +298,7 @@ def state_at(knots: Array, count: int, t: float, constants: Array) -> State:
 
 @compiled
 def twist_at(knots: Array, count: int, constants: Array, t: float) -> tuple[float, float, float]:
-    """Compute :meth:`OdometryChain.twist`. The arguments are those of :func:`state_at`."""
+    """Return the mean velocity of :meth:`OdometryChain.twist`. The arguments are those of :func:`state_at`."""
     a, b = state_at(knots, count, t - TWIST_TIME, constants), state_at(knots, count, t, constants)
     moved = se2.between_scalars(a[1], a[2], a[3], b[1], b[2], b[3])
     x, y, turned = se2.log_scalars(moved[0], moved[1], moved[2])

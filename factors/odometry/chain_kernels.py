@@ -30,7 +30,7 @@ _COS, _SIN, LAG, HOLD, _GYRO_BIAS, _USES_GYRO, SLIPPING = range(6, 13)
 
 @compiled
 def copy(row: Array, to: Array) -> None:
-    """Copy the vector ``row`` (N,) into ``to``."""
+    """Copy the elements of the vector ``row`` (N,) into ``to``."""
     for j in range(len(row)):
         to[j] = row[j]
 
@@ -94,11 +94,12 @@ def insert(
     constants: Array,
     horizon: float,
 ) -> int:
-    """Insert one row among the ``count`` existing rows, in order of time and after rows of equal time.
+    """Insert one row among the ``count`` existing ``rows``, in order of time and after rows of equal time.
 
-    ``kind``: :data:`VELOCITY`, :data:`INCREMENT` or :data:`GYRO`, with the values ``a``, ``b``, ``c`` and, for an
-    increment, the time ``unknown`` [s] of unknown motion. The states ``knots`` are updated with the model
-    ``constants``. If the new row is the newest, rows older than ``horizon`` [s] are deleted. Returns the new count.
+    ``kind``: :data:`VELOCITY`, :data:`INCREMENT` or :data:`GYRO`. ``a``, ``b``, ``c``: its values, which are (v, w, 0),
+    the logarithm of the motion, or (w, 0, 0). ``unknown`` [s]: the time of unknown motion in an increment. The
+    integrated states ``knots`` are updated with the model ``constants``. If the new row is the newest, rows older than
+    ``horizon`` [s] are deleted. Returns the new count.
     """
     i = count
     if count and t < knots[count - 1, T]:

@@ -15,10 +15,10 @@ from factors.se2 import Array, Integers, between_one, inverse_right_jacobian, tw
 
 
 class Steps(NamedTuple):
-    """K increments as arrays for compiled code.
+    """K odometry increments (motions between two poses) as arrays for compiled code.
 
-    ``deltas`` (K, 3): the increments. ``twists`` (K, 3): their logarithms. ``moving`` (K,) [s]: the times in motion.
-    ``whiteners`` (K, 3, 3): the matrices that whiten the residuals.
+    ``deltas`` (K, 3): the increments as relative poses. ``twists`` (K, 3): their logarithms. ``moving`` (K,) [s]: the
+    times in motion. ``whiteners`` (K, 3, 3): the matrices that whiten the residuals.
     """
 
     deltas: Array
@@ -52,7 +52,7 @@ class OdometryStack:
         linearize_all(poses, self._first, *given, jacobian, residual, 6 + self._column)
 
     def cost(self, poses: Array, parameters: Array) -> float:
-        """Half the sum of the squared residuals at ``poses`` (N, 3) and ``parameters`` of the graph."""
+        """Return half the sum of the squared residuals at ``poses`` (N, 3) and ``parameters`` (P,) of the graph."""
         return float(cost_of_all(poses, self._first, self._steps, self._constants(parameters), self._indices))
 
     def _constants(self, parameters: Array) -> Array:
@@ -62,9 +62,9 @@ class OdometryStack:
 class OdometryFactor:
     """An odometry increment as a factor on two poses, and optionally on constants of the odometry.
 
-    ``estimated``: the indices in :data:`factors.odometry.model.PARAMETERS` of the P constants that are estimated. The
-    methods take a list of values: the pose (3,) at the start, the pose (3,) at the end, and the corrections (P,) of the
-    constants if P > 0.
+    ``increment``: the measured motion. ``estimated``: the indices in :data:`factors.odometry.model.PARAMETERS` of the P
+    constants that are estimated. The methods take ``values``, a list of the pose (3,) at the start, the pose (3,) at
+    the end, and the corrections (P,) of the constants if P > 0.
     """
 
     def __init__(self, increment: Increment, estimated: Sequence[int] = ()) -> None:
@@ -77,20 +77,23 @@ class OdometryFactor:
 
     @property
     def packed(self) -> tuple[Array, Array, float, Array]:
-        """The increment (3,), its logarithm (3,), the time in motion [s], and the matrix (3, 3) that whitens the residual."""
+        """The increment (3,), its logarithm (3,), the time in motion [s], and the matrix (3, 3) to whiten residuals."""
         return self._increment.delta, self._arc, self._moving, self._whitener
 
     @property
     def kind(self) -> Hashable:
-        """A key that is equal for factors that can be linearised together."""
+        """A hashable key that is equal for factors that can be linearised together."""
         return self.estimated
 
     def stack(self, factors: Sequence["OdometryFactor"], numbers: Sequence[int], column: int) -> OdometryStack:
-        """Combine factors of the same ``kind`` into one object, for speed. See :class:`~factors.graph.Stackable`."""
+        """Combine factors of the same ``kind`` into one object, which is linearised faster. ``numbers``: the index of
+        each factor's first pose. ``column``: the index of the first odometry constant in the parameters of the
+        graph."""
         return OdometryStack(factors, numbers, column)
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """The whitened residual (3,) ``log(delta^-1 * start^-1 * end)``, and its Jacobian by each value."""
+        """Return the whitened residual (3,) ``log(delta^-1 * start^-1 * end)``, and a list of its Jacobians by each of
+        ``values``, the variables in the class docstring."""
         start, end, *constants = values
         if constants:
             changed = self._arc, self._moving, constants[0], self._indices
@@ -100,14 +103,14 @@ class OdometryFactor:
         return residual, blocks[:2]
 
     def cost(self, values: Sequence[Array]) -> float:
-        """Half the squared whitened residual."""
+        """Return half the squared norm of the whitened residual."""
         residual, _ = self.linearize(values)
         return 0.5 * float(residual @ residual)
 
 
 class ScaleFreeOdometryFactor(OdometryFactor):
-    """An odometry factor for graphs in which only odometry measures the scale of the map. The translation in the
-    residual is in the distance unit of the wheels, that is, divided by the estimated scale of distances.
+    """An odometry factor for graphs without other measurements of the scale of the map, such as ranges. The translation
+    in the residual is in the distance unit of the wheels, that is, divided by the estimated scale of distances.
 
     A residual in metres would decrease if the whole map shrinks. The estimated map would be too small by the fraction
     ``n s^2`` with the number ``n`` of increments and the standard deviation ``s`` of the scale.
@@ -128,7 +131,8 @@ class ScaleFreeOdometryFactor(OdometryFactor):
 
 @compiled
 def whitener(covariance: Array) -> Array:
-    """The inverse (3, 3) of the lower Cholesky root of a covariance (3, 3). Pivots that rounding makes too small are raised."""
+    """Return the inverse (3, 3) of the lower Cholesky factor of a covariance (3, 3). Its diagonal is kept above a
+    minimum, because of rounding."""
     a = math.sqrt(covariance[0, 0])
     b, c = covariance[1, 0] / a, covariance[2, 0] / a
     d = math.sqrt(max(covariance[1, 1] - b * b, ROUNDING * covariance[1, 1]))
@@ -177,8 +181,9 @@ def linearize(
 def linearize_changed(
     start: Array, end: Array, twist: Array, moving: float, constants: Array, indices: Integers, whitener: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Apply :func:`linearize` to an increment that is corrected by :func:`~factors.odometry.kernels.changed` with
-    ``twist``, ``moving``, ``constants`` and ``indices``."""
+    """Correct an increment for changed odometry constants, then linearise it between two poses ``start`` and ``end``.
+    ``twist``, ``moving``, ``constants``, ``indices``: as in :func:`~factors.odometry.kernels.changed`. ``whitener`` and
+    results: as in :func:`linearize`."""
     delta, by_changes = changed(twist, moving, constants, indices)
     return linearize(start, end, delta, by_changes, whitener)
 
@@ -246,7 +251,7 @@ def cost_of_all(
     constants: Array,
     indices: Integers,
 ) -> float:
-    """Half the sum of the squared residuals of :func:`linearize_all` with the same arguments."""
+    """Return half the sum of the squared residuals of :func:`linearize_all` with the same arguments."""
     total = 0.0
     for k in range(len(first)):
         delta = steps.deltas[k]

@@ -37,10 +37,11 @@ State = tuple[float, ...]  # a state of the integrated odometry: t, x, y, headin
 
 @compiled
 def relative(noise: Array, start: State, end: State) -> tuple[Array, Array, float, float]:
-    """The motion between two states of the integrated odometry, as in :func:`factors.odometry.model.relative_motion`.
+    """Return the motion between two states of the integrated odometry, as in
+    :func:`factors.odometry.model.relative_motion`.
 
-    ``noise``: a :data:`Noise` as an array. Returns the relative pose (3,), its covariance (3, 3), the duration [s], and
-    the time at rest [s].
+    ``noise``: a :data:`Noise` as an array. The results are the relative pose (3,), its covariance (3, 3), the duration
+    [s], and the time at rest [s].
     """
     c, s, dx, dy = math.cos(start[3]), math.sin(start[3]), end[1] - start[1], end[2] - start[2]
     x, y, turned = c * dx + s * dy, c * dy - s * dx, wrap_scalar(end[3] - start[3])
@@ -71,10 +72,10 @@ def relative(noise: Array, start: State, end: State) -> tuple[Array, Array, floa
 
 @compiled
 def relatives(noise: Array, starts: Array, ends: Array, constants: Array, indices: Integers) -> tuple[Array, Array]:
-    """Compute :func:`relative` for N pairs of states (N, 8), and correct the motions by :func:`recalibrated`.
+    """Return the motions between N pairs of odometry states (N, 8): relative poses (N, 3) and covariances (N, 3, 3).
 
-    ``constants`` (P,), ``indices`` (P,): corrections of the estimated constants, and their indices among all constants.
-    Returns the relative poses (N, 3) and their covariances (N, 3, 3).
+    ``noise``: a :data:`Noise` as an array. ``constants`` (P,), ``indices`` (P,): the motions are corrected by these
+    changes of odometry constants, see :func:`recalibrated`.
     """
     count = len(starts)
     deltas, covariances = np.empty((count, 3)), np.empty((count, 3, 3))
@@ -183,7 +184,8 @@ def _widen(covariance: Array) -> None:
 
 @compiled
 def recalibrated(delta: Array, moving: float, constants: Array, indices: Integers) -> Array:
-    """Correct the increment ``delta`` (3,) for changed constants, as :func:`recalibrate` does, without derivatives.
+    """Return the increment ``delta`` (3,) corrected for changed constants, as :func:`recalibrate` does, without
+    derivatives. ``moving`` [s]: the time in motion.
 
     ``constants`` (P,), ``indices`` (P,): corrections of the estimated constants, and their indices among all constants.
     """
@@ -221,8 +223,9 @@ def recalibrate(twist: Array, moving: float, changes: Array) -> tuple[Array, Arr
 def changed(twist: Array, moving: float, constants: Array, indices: Integers) -> tuple[Array, Array]:
     """Correct an increment as :func:`recalibrate` does, for P of the four constants.
 
-    ``constants`` (P,), ``indices`` (P,): corrections of the estimated constants, and their indices among all constants.
-    Returns the corrected increment (3,) and its Jacobian (3, P) by ``constants``.
+    ``twist`` (3,): the logarithm of the increment. ``moving`` [s]: the time in motion. ``constants`` (P,), ``indices``
+    (P,): corrections of the estimated constants, and their indices among all constants. Returns the corrected increment
+    (3,) and its Jacobian (3, P) by ``constants``.
     """
     delta, by_changes = recalibrate(twist, moving, all_changes(constants, indices))
     out = np.empty((3, len(indices)))
@@ -234,7 +237,7 @@ def changed(twist: Array, moving: float, constants: Array, indices: Integers) ->
 
 @compiled
 def all_changes(constants: Array, indices: Integers) -> Array:
-    """The changes (4,) of all odometry constants: ``constants`` (P,) at the indices ``indices`` (P,), and zeros elsewhere."""
+    """Return the changes (4,) of all odometry constants: ``constants`` (P,) at ``indices`` (P,), otherwise zero."""
     changes = np.zeros(4)
     for i in range(len(indices)):
         changes[indices[i]] = constants[i]

@@ -34,17 +34,16 @@ LEAST_POSITION, LEAST_HEADING = 1e-3, 1e-4  # m and rad per sqrt(s): minimum noi
 
 @dataclass(frozen=True, slots=True)
 class Growth:
-    """The standard deviation of one error component per square root of distance, of rotation, and of time.
-
-    The units are m or rad (the unit of the component) per sqrt(m), per sqrt(rad) and per sqrt(s).
-    """
+    """The noise of one component of the odometry, a random walk. Its standard deviation grows with the square roots of
+    distance, of rotation, and of time. ``per_distance``, ``per_rotation``, ``per_time``: the standard deviations per
+    sqrt(m), per sqrt(rad) and per sqrt(s), in m for a translation and in rad for a rotation."""
 
     per_distance: float = 0.0
     per_rotation: float = 0.0
     per_time: float = 0.0
 
     def widened(self, *, per_distance: float = 0.0, per_rotation: float = 0.0, per_time: float = 0.0) -> "Growth":
-        """Return the growth after adding independent errors with these standard deviations."""
+        """Return the sum of this random walk and an independent one with these standard deviations."""
         return Growth(
             math.hypot(self.per_distance, per_distance),
             math.hypot(self.per_rotation, per_rotation),
@@ -85,7 +84,7 @@ class OdometryModel:
     heading: Growth = field(default_factory=Growth)
 
     def noise(self) -> Noise:
-        """The noise of the model as a tuple for compiled code. See :data:`factors.odometry.kernels.Noise`."""
+        """Return the noise of the model as a tuple for compiled code. See :data:`factors.odometry.kernels.Noise`."""
         growths = (self.along, self.lateral, self.heading)
         sigmas = [s for g in growths for s in (g.per_distance, g.per_rotation, g.per_time)]
         sigmas += [self.unknown_distance, self.unknown_rotation]
@@ -94,7 +93,7 @@ class OdometryModel:
 
 
 def relative_motion(model: OdometryModel, start: ChainState, end: ChainState) -> Increment:
-    """The motion between two states of the integrated odometry, with its covariance.
+    """Return the motion between two states of the integrated odometry, with its covariance.
 
     The heading error is a random walk along the path, so it also displaces the end of the motion. Let v be the variance
     of the heading, and r the distance from start to end. For a uniform walk along a straight line, the variance of the

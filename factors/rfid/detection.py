@@ -30,14 +30,14 @@ from factors.se2 import Array, Integers
 @dataclass(frozen=True, eq=False)
 class TagArray:
     """T tags in the world, or on a robot. ``points`` (T, 3) [m]: positions in the world, or in the robot frame.
-    ``facing`` (T,) [rad]: the direction that each tag faces, NaN if unknown."""
+    ``facing`` (T,) [rad]: the direction of each tag's front in the horizontal plane of that frame, NaN if unknown."""
 
     points: Array
     facing: Array
 
     @cached_property
     def normals(self) -> Array:
-        """The facing directions as unit vectors (T, 2), zero if unknown."""
+        """The directions of the tags' fronts as unit vectors (T, 2), zero if unknown."""
         known = np.isfinite(self.facing)
         angle = np.where(known, self.facing, 0.0)
         return np.where(known[:, None], np.column_stack((np.cos(angle), np.sin(angle))), 0.0)
@@ -91,7 +91,8 @@ class TagReadCounts:
         return np.asarray(self.tags[self.hits.any(axis=0)])
 
     def with_states(self, tags: Integers, odds: Array, elsewhere: Array) -> TagReadCounts:
-        """Return the counts with ``tags`` (U,) listed, and with their ``odds`` (U,) and ``elsewhere`` (U,) replaced."""
+        """Return the counts with new values of ``odds`` (U,) and ``elsewhere`` (U,) for ``tags`` (U,), indices in the
+        map. Tags that are not listed yet are added to the listed tags."""
         both = np.union1d(self.tags, tags)
         hits = np.zeros((len(self.hits), len(both)), dtype=np.int64)
         all_odds, all_elsewhere = np.full(len(both), self.unlisted_odds), np.zeros(len(both))
@@ -145,12 +146,12 @@ class Score(NamedTuple):
 
     @classmethod
     def of_signals(cls, nll: Array, gradient: Array, information: Array) -> Score:
-        """Make the score of signal strengths or phases. ``expected`` is set to ``nll``, and ``variance`` to zero."""
+        """Return the score of signal strengths or phases. ``expected`` is set to ``nll``, and ``variance`` to zero."""
         return cls(nll, gradient, information, nll, np.zeros(len(nll)))
 
 
 class ExpectedReads(NamedTuple):
-    """Observed and predicted reads of C tags in K measurements.
+    """Observed and predicted reads of C tags in K measurements, each of several inventory rounds of one antenna.
 
     ``tags`` (C,): indices in the map. ``hits`` (K, C): numbers of reads. ``p`` (K, C): probability that one round reads
     the tag. ``distance`` (K, C) [m]: horizontal distance from antenna to tag.
@@ -164,11 +165,11 @@ class ExpectedReads(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class RfidLikelihood:
-    """The likelihood of read counts as a function of the robot's pose.
+    """The likelihood of RFID read counts as a function of the robot's pose.
 
     ``model``: the antennas and their detection models. ``tags``: the tags of the map, or the tags on the robot if the
-    antennas of the model are fixed in the world. ``parameters`` (Q,): adjustments of detection models, mounting and
-    clock (:mod:`factors.rfid.parameters`), initially zero. With M detection models and A antennas, Q is 2 M + A + 2.
+    antennas of the model are fixed in the world. ``parameters`` (Q,): calibration of detection models, mounting and
+    clock, initially zero. With M detection models and A antennas, Q is 2 M + A + 2. See :mod:`factors.rfid.parameters`.
     """
 
     model: RfidModel
@@ -181,7 +182,7 @@ class RfidLikelihood:
         object.__setattr__(self, "_unadjusted", self)
 
     def adjusted(self, parameters: Array) -> RfidLikelihood:
-        """The likelihood with other ``parameters`` (Q,). Raises ValueError if their number is wrong."""
+        """Return the likelihood with other ``parameters`` (Q,). Raises ValueError if their number is wrong."""
         parameters, out = np.asarray(parameters, dtype=float), copy.copy(self)
         if parameters.shape != self.parameters.shape:
             raise ValueError(
@@ -204,14 +205,15 @@ class RfidLikelihood:
 
     @cached_property
     def packed(self) -> Packed:
-        """The detection models, adjusted to the parameters, as a tuple of arrays for compiled code."""
+        """The detection models with the ``parameters`` applied, as a tuple of arrays for compiled code."""
         if self._unadjusted is self:
             return self.model.packed()
         return adjusted(self._unadjusted.packed, self.parameters)
 
     @cached_property
     def arrays(self) -> tuple[Packed, MapTags]:
-        """The detection models before adjustment, and the tags of the map, as tuples of arrays for compiled code."""
+        """The detection models without the ``parameters`` of the likelihood, and the tags of the map, as tuples of
+        arrays for compiled code."""
         return self._unadjusted.packed, self._unadjusted._map
 
     def joint_score(
@@ -231,7 +233,7 @@ class RfidLikelihood:
         return Score(np.array((nll,)), gradient[None], information[None], expected, variance)
 
     def score(self, poses: Array, counts: TagReadCounts) -> Score:
-        """The tempered negative log-likelihood of ``counts`` at poses (N, 3), with derivatives by the poses."""
+        """Return the tempered negative log-likelihood of ``counts`` at poses (N, 3), with derivatives by the poses."""
         poses = np.ascontiguousarray(np.atleast_2d(poses), dtype=float)
         no_columns = np.full(len(self.parameters), -1, dtype=np.int64)
         alpha = float(self.model.tempering)
@@ -240,13 +242,15 @@ class RfidLikelihood:
     def displaced(
         self, poses: Array, counts: TagReadCounts, hypotheses: Array, margin: float, parameters: Array, odds: Array
     ) -> tuple[Integers, Array, NDArray[np.bool_]]:
-        """Compute the log-likelihood of possible states of each tag, such as weak or moved. Returns the indices (U,) of
-        the evaluated tags, the log-likelihoods (U, S), and a mask (U,) of the tags that were read.
+        """Compute the log-likelihood of S possible states of each tag, such as weak or moved. Returns the indices (U,)
+        of the evaluated tags, their log-likelihoods (U, S), and a mask (U,) of the tags that were read.
 
         ``poses`` (N, 3): possible robot poses. The likelihood is the mean over all poses.
         ``hypotheses`` (S, 4): the states, from :func:`factors.rfid.tag_states.hypotheses`.
-        ``margin`` [m]: tags that are farther than reach plus margin from all poses are left out, unless they were read.
-        ``parameters`` (Q,): parameters of the likelihood. ``odds`` (T,): tags with odds ``-inf`` are left out.
+        ``margin`` [m]: tags that are farther than :attr:`reach` plus margin from all poses are left out, unless they
+        were read.
+        ``parameters`` (Q,): parameters of the likelihood. ``odds`` (T,): the prior log-odds that each tag of the map is
+        in one of these states. Tags with ``-inf`` are left out.
 
         The log-likelihoods are tempered, and relative to that of a tag out of reach that is never read.
         """
@@ -254,10 +258,10 @@ class RfidLikelihood:
         return tag_states.displaced(*self._tabled, counts.packed, poses, margin, odds, hypotheses, alpha, parameters)
 
     def log_likelihood(self, poses: Array, counts: TagReadCounts, parameters: Array | None = None) -> Array:
-        """Compute the tempered log-likelihood (N,) of ``counts`` for particles at poses (N, 3), from tables.
+        """Return the tempered log-likelihood (N,) of ``counts`` for particles at poses (N, 3), interpolated in tables.
 
-        ``parameters`` (N, Q): the parameters of each particle, by default :attr:`parameters`. If particles differ in
-        their time offset, the velocity of the first measurement is used for all measurements.
+        ``parameters`` (N, Q): the parameters of each particle, by default :attr:`parameters`. Limitation: if particles
+        differ in their time offset, the velocity of the first measurement is used for all measurements.
         """
         poses = np.ascontiguousarray(poses, dtype=float)
         unchanged = parameters is None and not (self.parameters.any() or counts.offsets.any() or self.model.fixed)
@@ -280,7 +284,7 @@ class RfidLikelihood:
         return make_tables(self.model, self.packed, self.tags.points[:, 2])
 
     def work(self, counts: TagReadCounts) -> int:
-        """An estimate of the computing time of :meth:`log_likelihood` per pose: about the number of evaluated tags."""
+        """Return the approximate computing time of :meth:`log_likelihood` per pose, in evaluations of one tag."""
         if self.model.fixed:
             return PLACED + BY_ANTENNA * len(counts.antennas) * len(self.tags.points)
         return self._unadjusted._places.work(counts.packed)
@@ -292,7 +296,8 @@ class RfidLikelihood:
 
     @cached_property
     def reached(self) -> float:
-        """The mean number of tags in reach of a random pose among the tags. Tags on a robot are always in reach."""
+        """The mean number of tags in reach of a robot, for robot positions uniform in the bounding box of the tags. If
+        the tags are on the robot, their number."""
         if self.model.fixed:
             return float(len(self.tags.points))
         return in_reach(self.tags.points[:, :2], self._unadjusted.reach)
@@ -303,26 +308,26 @@ class RfidLikelihood:
 
     @property
     def uses_facing(self) -> bool:
-        """True if the read probability of any antenna depends on the facing of tags."""
+        """True if the read probability of any antenna depends on the direction of the tags' fronts."""
         return any(self.model.models[a.model].uses_facing for a in self.model.antennas)
 
     def robot_tables(self, finest: int, facings: int) -> RobotTables:
-        """Compute tables of the read probability of each antenna over the tag's position in the robot frame.
-        ``finest``, ``facings``: as in :func:`factors.rfid.places.robot_tables`."""
+        """Return tables of the read probability of each antenna over the tag's position in the robot frame. ``finest``:
+        the cell size, as a multiple of the smallest one. ``facings``: the number of directions of the tag's front."""
         antennas = antennas_of(self.packed, self._unadjusted._tables)
         return robot_tables(antennas, self.tags.points[:, 2], finest, facings if self.uses_facing else 0)
 
     def by_tag(self, pose: Array, counts: TagReadCounts) -> tuple[Array, Array, Array]:
         """Return the tempered negative log-likelihood (T,) of each tag's reads at one robot pose (3,), its gradient (T,
-        2) by the tag's world position, and its information (T, 2, 2). ``counts`` must list all tags of the map."""
+        2) by the tag's world position, and its Fisher information (T, 2, 2). ``counts`` must list all tags."""
         arrays, alpha = counts.packed[:4], self.model.tempering
         pose = np.asarray(pose, dtype=float)
         nll, slope, curve = kernels.by_tag(self.packed, pose, self.tags.points, self.tags.normals, *arrays)
         return alpha * nll, alpha * slope[:, 3:], alpha * curve[:, 3:, 3:]
 
     def expected(self, pose: Array, counts: TagReadCounts, parameters: Array) -> ExpectedReads:
-        """Return the observed and predicted reads of all tags in reach of a ``pose`` (3,) or listed in ``counts``.
-        ``parameters`` (Q,): see the class."""
+        """Return the observed and predicted reads of all tags that are in reach of a robot at ``pose`` (3,) or listed
+        in ``counts``. ``parameters`` (Q,): calibration of the detection models, see the class."""
         return ExpectedReads(*kernels.predicted(*self.arrays, counts.packed, pose, parameters))
 
     def probabilities(self, poses: Array, antenna: int) -> Array:

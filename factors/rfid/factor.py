@@ -51,16 +51,17 @@ class TagLikelihood(Protocol):
         """The measurement model, with an attribute ``tempering``, the exponent of the likelihood."""
 
     def score(self, poses: Array, reads: Any, /) -> Score:
-        """The tempered likelihood of ``reads`` at poses (N, 3), with derivatives."""
+        """Return the tempered likelihood of ``reads`` at poses (N, 3), with derivatives."""
 
     def log_likelihood(self, poses: Array, reads: Any, /) -> Array:
-        """The tempered log-likelihood (N,) of ``reads`` at poses (N, 3), without derivatives, for particles."""
+        """Return the tempered log-likelihood (N,) of ``reads`` at poses (N, 3), without derivatives, for particles."""
 
 
 class TagProblem(NamedTuple):
-    """The likelihood of read counts, for compiled code. ``packed``: detection models before adjustment. ``of_map``: the
-    tags of the map. ``counts``: reads and misses. ``tempering``: exponent of the likelihood. ``parameters`` (Q,):
-    adjustments of the models. ``estimated`` (P,): the indices of the parameters that are estimated."""
+    """The likelihood of RFID read counts, as a tuple for compiled code. ``packed``: detection models with all
+    parameters zero. ``of_map``: the tags of the map. ``counts``: numbers of reads and of inventory rounds.
+    ``tempering``: exponent of the likelihood. ``parameters`` (Q,): calibration of the models. ``estimated`` (P,):
+    indices of the estimated parameters."""
 
     packed: Packed
     of_map: MapTags
@@ -79,9 +80,9 @@ class RfidFactor:
     otherwise :class:`~factors.rfid.signals.RssiReads` or :class:`~factors.rfid.signals.PhaseReads`.
     ``estimated`` (P,): indices of the estimated parameters (:mod:`factors.rfid.parameters`). Only for read counts.
 
-    Methods with ``values`` take a list of the pose (3,) and, if P > 0, the parameters (P,). For any number of reads
-    there are 4 + P residuals. Half the sum of their squares has the value, the gradient and the Fisher information of
-    the negative log-likelihood (:func:`factors.graph.compressed`).
+    Methods with sequences ``values`` take a list of the pose (3,) and, if P > 0, the parameters (P,). For any number of
+    reads there are 4 + P residuals. Half the sum of their squares has the value, the gradient and the Fisher
+    information of the negative log-likelihood (:func:`factors.graph.compressed`).
     """
 
     likelihood: TagLikelihood
@@ -90,18 +91,18 @@ class RfidFactor:
 
     @property
     def rows(self) -> int:
-        """Number of residuals."""
+        """The number of residuals: 4 plus the number of estimated parameters."""
         return ROWS + len(self.estimated)
 
     @property
     def work(self) -> int:
-        """An estimate of the computing time at one pose: about the number of reads and misses to evaluate."""
+        """An estimate of the computing time at one pose. The unit is the evaluation of one read or missed read."""
         if isinstance(self.likelihood, RfidLikelihood) and isinstance(self.reads, TagReadCounts):
             return self.likelihood.work(self.reads)
         return len(self.reads.antennas)
 
     def fixed(self, values: Array) -> RfidFactor:
-        """The factor on the pose only, with the estimated parameters fixed at ``values`` (P,)."""
+        """Return the factor on the pose only, with the estimated parameters fixed at ``values`` (P,)."""
         if not isinstance(self.likelihood, RfidLikelihood):
             return self
         return replace(self, likelihood=self.likelihood.adjusted(self._parameters(values)), estimated=())
@@ -114,8 +115,8 @@ class RfidFactor:
         return out
 
     def score(self, values: Sequence[Array]) -> Score:
-        """The tempered negative log-likelihood at one pose (3,) and the estimated parameters (P,), with gradient (1, 3
-        + P) and information (1, 3 + P, 3 + P)."""
+        """Return the tempered negative log-likelihood with its gradient (1, 3 + P) and Fisher information (1, 3 + P, 3
+        + P). ``values``: one pose (3,) and, if P > 0, the estimated parameters (P,)."""
         if not self.estimated:
             return self.likelihood.score(values[0], self.reads)
         assert isinstance(self.likelihood, RfidLikelihood)
@@ -123,7 +124,8 @@ class RfidFactor:
         return self.likelihood.joint_score(values[0], self._parameters(values[1]), self.reads, self.estimated)
 
     def log_likelihood(self, poses: Array, values: Array | None = None) -> Array:
-        """The tempered log-likelihood (N,) of poses (N, 3). ``values`` (N, P): the estimated parameters of each pose, or None."""
+        """Return the tempered log-likelihood (N,) of poses (N, 3). ``values`` (N, P): the parameters of each pose, or
+        None."""
         if values is None:
             return self.likelihood.log_likelihood(poses, self.reads)
         assert isinstance(self.likelihood, RfidLikelihood)
@@ -131,23 +133,24 @@ class RfidFactor:
         return self.likelihood.log_likelihood(poses, self.reads, self._parameters(values))
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """The residual (4 + P,), and its Jacobians by the pose (4 + P, 3) and, if P > 0, by the estimated parameters (4 + P, P)."""
+        """Return the residual (4 + P,), and its Jacobians by the pose (4 + P, 3) and, if P > 0, by the estimated
+        parameters (4 + P, P)."""
         score = self.score(values)
         residual, jacobian = compressed(float(score.nll[0]), score.gradient[0], score.information[0])
         return residual, [jacobian[:, :3], jacobian[:, 3:]] if self.estimated else [jacobian]
 
     def cost(self, values: Sequence[Array]) -> float:
-        """The tempered negative log-likelihood at these values."""
+        """Return the tempered negative log-likelihood. ``values``: the variables, as in the class docstring."""
         return float((self.fixed(values[1]) if self.estimated else self).score(values[:1]).nll[0])
 
     def correct(
         self, pose: Array, covariance: Array, values: Array = NO_VALUES, iterations: int = ITERATIONS
     ) -> Correction:
-        """Correct a Gaussian of the pose and the estimated parameters, by Fisher scoring.
+        """Correct a Gaussian estimate of the pose and the estimated parameters, by Fisher scoring.
 
         ``pose`` (3,), ``values`` (P,): the prediction. ``covariance`` (3 + P, 3 + P): its covariance, with a body-frame
         perturbation of the pose. ``iterations``: maximum number of steps. A step that does not reduce the cost is
-        halved. The evidence in the result is computed by Laplace's method.
+        halved. Returns the correction, with ``evidence`` by Laplace's method.
         """
         pose, covariance = np.ascontiguousarray(pose, dtype=float), np.ascontiguousarray(covariance, dtype=float)
         problem = (*self._problems(), float(self.likelihood.model.tempering), pose, values)
@@ -173,13 +176,13 @@ class RfidFactor:
 
 @dataclass(frozen=True, eq=False)
 class RfidTagFactor:
-    """The read counts of one tag as a factor on the robot's pose and on the tag's position.
+    """The read counts of one RFID tag as a factor on the robot's pose and on the tag's position.
 
-    ``likelihood``: its map has the tag. The height and facing in the map are used, but not the position.
+    ``likelihood``: has the tag in its map. The tag's height and facing are those of the map. Its position is estimated.
     ``tag``: the index of the tag in the map. ``counts``: reads that list all tags of the map.
 
-    The methods take a list of the pose (3,) and the tag's position (2,) in the world. For any number of reads there are
-    six residuals, see :func:`factors.graph.compressed`.
+    The methods take ``values``, a list of the pose (3,) and the tag's position (2,) in the world. For any number of
+    reads there are six residuals, see :func:`factors.graph.compressed`.
     """
 
     likelihood: RfidLikelihood
@@ -187,18 +190,18 @@ class RfidTagFactor:
     counts: TagReadCounts
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """The residual (6,), and its Jacobians by the pose (6, 3) and by the tag's position (6, 2)."""
+        """Return the residual (6,), and its Jacobians by the pose (6, 3) and by the tag's position (6, 2)."""
         nll, gradient, information = self.score(values)
         residual, jacobian = compressed(nll, gradient, information)
         return residual, [jacobian[:, :3], jacobian[:, 3:]]
 
     def cost(self, values: Sequence[Array]) -> float:
-        """The tempered negative log-likelihood at these values."""
+        """Return the tempered negative log-likelihood. ``values``: the pose (3,) and the tag's position (2,)."""
         return self.score(values)[0]
 
     def score(self, values: Sequence[Array]) -> tuple[float, Array, Array]:
-        """The tempered negative log-likelihood, and its gradient (5,) and Fisher information (5, 5) by the body-frame
-        perturbation of the pose and by the tag's position in the world."""
+        """Return the tempered negative log-likelihood, and its gradient (5,) and Fisher information (5, 5) by the
+        body-frame perturbation of the pose (3) and by the tag's position in the world (2)."""
         tags, counts, alpha = self.likelihood.tags, self.counts, self.likelihood.model.tempering
         point = np.array([(values[1][0], values[1][1], tags.points[self.tag, 2])])
         hits = np.ascontiguousarray(counts.hits[:, self.tag : self.tag + 1])
@@ -278,8 +281,8 @@ def _corrected(
 
 @compiled
 def _difference(pose: Array, values: Array, target: Array, other_values: Array) -> Array:
-    """The step (3 + P,) from ``pose`` (3,) and ``values`` (P,) to ``target`` (3,) and ``other_values`` (P,). Its first
-    three components are the twist from ``pose`` to ``target``."""
+    """Return the step (3 + P,) from ``pose`` (3,) and ``values`` (P,) to ``target`` (3,) and ``other_values`` (P,). Its
+    first three components are the twist from ``pose`` to ``target``."""
     out = np.empty(3 + len(values))
     out[0], out[1], out[2] = se2.twist_to(pose, target)
     for i in range(len(values)):
@@ -310,7 +313,7 @@ def _scoring_step(prior_information: Array, information: Array, gradient: Array,
 
 @compiled
 def _posterior(prior_information: Array, information: Array) -> tuple[Array, float]:
-    """The covariance (D, D) after adding ``information`` to the prior, and the change of its log determinant."""
+    """Return the covariance (D, D) after adding ``information`` to the prior, and the change of its log determinant."""
     size, both = len(information), prior_information.copy()
     for i in range(size):
         for j in range(size):
@@ -321,8 +324,8 @@ def _posterior(prior_information: Array, information: Array) -> tuple[Array, flo
 
 @compiled
 def _innovation(gradient: Array, information: Array, covariance: Array, tempering: float) -> tuple[float, int]:
-    """The normalised innovation squared of a likelihood and its degrees of freedom, from its ``gradient`` (D,) and
-    ``information`` (D, D) at the prediction with ``covariance`` (D, D)."""
+    """Return the normalised innovation squared of a likelihood and its degrees of freedom. ``gradient`` (D,),
+    ``information`` (D, D): at the prediction with ``covariance`` (D, D)."""
     size, predicted, pull = (
         len(gradient),
         product(product(information, covariance), information),
