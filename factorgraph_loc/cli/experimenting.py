@@ -222,8 +222,7 @@ def _summary(rows: Sequence[dict[str, Any]], metrics: Sequence[str]) -> tuple[li
     """Return the header and the rows of the table of results. ``rows``: one dictionary of values for each run.
 
     A row of the table summarizes the runs with the same label, sensors and swept values. Its cells have the median,
-    minimum and maximum of each of the ``metrics``.
-    """
+    minimum and maximum of each of the ``metrics``."""
     from statistics import median
 
     from factorgraph_loc.evaluation.tables import SCORED, counted

@@ -124,8 +124,7 @@ def _value(option: str, given: str | None, default: str, expected: str, parse: C
 
     ``given``: the text on the command line, None if the option is missing. If it is missing and ``asks`` is true, the
     user is asked until the answer is valid. ``default``: the text without an answer. ``expected``: describes valid
-    texts. ``parse`` raises KeyError or ValueError for an invalid text. Raises InputError if ``given`` is invalid.
-    """
+    texts. ``parse`` raises KeyError or ValueError for an invalid text. Raises InputError if ``given`` is invalid."""
     while True:
         text = default if given is None else given
         if given is None and asks:

@@ -156,8 +156,7 @@ def _replaced(stream: TextIO | None, number: int, kind: type[io.TextIOWrapper], 
     """Return a stream of class ``kind`` that writes to the descriptor of ``stream``.
 
     ``number``: the descriptor to use if ``stream`` is None, which means that it was closed when Python started.
-    ``errors``: how characters that cannot be encoded are replaced.
-    """
+    ``errors``: how characters that cannot be encoded are replaced."""
     if not isinstance(stream, io.TextIOWrapper):
         return kind(os.fdopen(number, "wb", closefd=False), "utf-8", errors)
     encoding, unbuffered, by_line = stream.encoding, stream.write_through, stream.line_buffering

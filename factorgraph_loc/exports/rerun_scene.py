@@ -152,8 +152,7 @@ def _path(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colour
 def _trail(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colour: Colour) -> None:
     """Draw the path up to the current time, as segments that appear at their times. A gap has no segment.
 
-    ``at``: the entity path in Rerun.
-    """
+    ``at``: the entity path in Rerun."""
     positions = trajectory.poses[:, :2]
     near = np.diff(trajectory.t) <= scene.GAP
     pieces = np.stack((positions[:-1], positions[1:]), axis=1)
@@ -237,8 +236,7 @@ def _predicted_pixels(model: reprojection.CameraModel, pose: Array, points: Arra
 def _camera_and_robot(log: Log, runs: Sequence[StoredRun]) -> tuple[str, Trajectory | None]:
     """Return the entity path of the camera in Rerun, and the trajectory of the robot that carries the camera, or None.
 
-    It is the trajectory of the first run that has one, or else the reference of the log.
-    """
+    It is the trajectory of the first run that has one, or else the reference of the log."""
     for run in runs:
         if len(run.played()):
             return f"{WORLD}/{run.name}/robot/camera", run.played()
@@ -282,8 +280,7 @@ def _blueprint(log: Log, runs: Sequence[StoredRun]) -> rrb.Blueprint:
 def _extent(log: Log, runs: Sequence[StoredRun]) -> tuple[Array, float]:
     """Return the centre (2,) [m] and the larger side [m] of the drawn scene.
 
-    The side is at least 5 m, to keep the viewpoint outside of a small scene.
-    """
+    The side is at least 5 m, to keep the viewpoint outside of a small scene."""
     parts = [run.final.poses[:, :2] for run in runs] + [np.array(log.world.walls).reshape(-1, 2)]
     parts += [marks.positions[:, :2] for marks, _, _ in scene.layers(log) if not marks.dense]
     if log.reference is not None:

@@ -52,8 +52,7 @@ def open_viewer(bind: str) -> Iterator[str]:
 def _reachable(bind: str) -> str:
     """Return the address at which this machine reaches a server that listens on ``bind``.
 
-    Raises InputError if ``bind`` is not an IP address.
-    """
+    Raises InputError if ``bind`` is not an IP address."""
     try:
         address = ipaddress.ip_address(bind)
     except ValueError as error:

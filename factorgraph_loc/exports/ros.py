@@ -99,8 +99,7 @@ def _map(log: Log, make: "_Maker") -> list[dict[str, Any]]:
 def _poses(topic: str, frame: str, trajectory: Trajectory, t0_ns: int, make: "_Maker") -> Iterator[Message]:
     """Yield two messages for each pose of a trajectory: the transform of ``frame`` on ``/tf``, and the odometry on ``topic``.
 
-    Odometry has the covariance of the pose, zero if it is unknown.
-    """
+    Odometry has the covariance of the pose, zero if it is unknown."""
     covariances = np.zeros((len(trajectory), 6, 6))
     if trajectory.covariances is not None:
         known = np.isfinite(trajectory.covariances).all(axis=(1, 2))

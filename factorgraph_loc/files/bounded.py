@@ -139,7 +139,7 @@ def foreign(source: object, what: str) -> Iterator[None]:
 
 
 def limit_memory() -> None:
-    """Enable :func:`limited_memory` in this process. Commands call this; programs that import the package do not."""
+    """Make :func:`limited_memory` effective. Commands call this; programs that import the package do not."""
     _limited.set()
 
 
@@ -193,9 +193,9 @@ def _require_file(path: Path, kind: str) -> None:
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Discard all output to descriptor 2 (stderr) in this block, if it runs in the main thread.
+    """Discard all output to file descriptor 2 (stderr) in this block. Has no effect outside of the main thread.
 
-    Messages that other threads print in the meantime are discarded too, so keep the block short.
+    Output of other threads in the meantime is discarded too, so keep the block short.
     """
     if threading.current_thread() is not threading.main_thread():
         yield

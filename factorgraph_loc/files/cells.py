@@ -94,7 +94,8 @@ class Cells:
         """Return the cells after ``rules`` are applied: without invalid rows, and sorted by timestamp.
 
         ``columns``: the description of each field, the timestamps first. ``offset`` [s]: is added to the timestamps.
-        ``more``: further invalid cells. If rows are skipped or sorted, a warning is appended to ``warnings``.
+        ``more``: invalid cells that the caller has found in addition. If rows are skipped or sorted, a warning is
+        appended to ``warnings``. Raises InputError at an invalid or late row unless ``rules`` allow that.
         """
         rules = self.rules
         if rules is None or rules.refuse:
@@ -110,9 +111,10 @@ class Cells:
         return kept
 
     def without(self, faults: Sequence[Fault], warnings: list[Notice]) -> "Cells":
-        """Return the cells of the rows without ``faults``. If rows are skipped, a warning is appended to ``warnings``.
+        """Return the cells of the rows that have no invalid cell in ``faults``.
 
-        Raises InputError at the first fault unless ``rules`` skip invalid rows.
+        Raises InputError at the first invalid cell unless ``rules`` skip invalid rows. Then a warning is appended to
+        ``warnings``.
         """
         if self.rules is None or self.rules.bad_rows == "refuse":
             self.require(faults)
@@ -138,11 +140,12 @@ class Cells:
                 raise fault.error(self.path, self.rows, self.rules.skipping if self.rules and is_few else "")
 
     def fault(self, name: str, wrong: NDArray[np.bool_], expected: str) -> Fault:
-        """Return the fault of a field. ``wrong`` (N,): mask of invalid cells. ``expected``: describes valid cells."""
+        """Return a mark of invalid cells of the field ``name``. ``wrong`` (N,): their mask. ``expected``: describes
+        valid cells."""
         return Fault(self.labels.get(name, name), self.columns[name], wrong, expected)
 
     def _faults(self, name: str, column: Column) -> Sequence[Fault]:
-        """Return the faults of a field: one for each reason why cells are invalid. ``column``: describes the field."""
+        """Return the invalid cells of a field, one :class:`Fault` per reason. ``column``: describes the field."""
         if column.kind in NAMES:
             return self._names(name, column)[1]
         if column.kind in NUMBERS:
@@ -212,8 +215,7 @@ class Cells:
     def _floats(self, texts: Sequence[Any]) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
         """Return the numbers (N,) in N texts, and masks (N,) of the empty and of the invalid texts.
 
-        The numbers of empty and invalid texts are NaN.
-        """
+        The numbers of empty and invalid texts are NaN."""
         if self.decimal == ".":
             with suppress(ValueError):  # the fast case: no text is empty or invalid
                 values = np.array(list(map(float, texts)), dtype=float)
@@ -241,8 +243,8 @@ class Cells:
 
 
 def _converted(cells: Iterable[Any], convert: Callable[[Any], T], blank: T) -> tuple[list[T], NDArray[np.bool_]]:
-    """Convert N cells by the function ``convert``. Return the N results, and a mask (N,) of the cells for which
-    ``convert`` raises an exception. The result of such a cell is ``blank``."""
+    """Return the values (N) of ``convert`` for N cells, and a mask (N,) of the cells for which ``convert`` raises an
+    exception. The value of such a cell is ``blank``."""
     out: list[T] = []
     wrong: list[int] = []
     for cell in cells:
@@ -257,7 +259,7 @@ def _converted(cells: Iterable[Any], convert: Callable[[Any], T], blank: T) -> t
 
 
 def _limited(stamp: int) -> int:
-    """Return a timestamp [ns]. Raises OverflowError if it exceeds :data:`LATEST`."""
+    """Return the timestamp ``stamp`` [ns] unchanged. Raises OverflowError if it exceeds :data:`LATEST`."""
     if abs(stamp) > LATEST:
         raise OverflowError
     return stamp

@@ -36,7 +36,7 @@ def not_finite(names: Sequence[str], table: Array) -> list[Fault]:
 def in_order(
     source: object, rows: Integers, t_ns: Integers, warnings: list[Notice], rules: RowRules | None = None
 ) -> Integers:
-    """Return the indices (M,) of the rows to keep: of rows with equal timestamps ``t_ns`` (N,) only the last.
+    """Return the indices (M,) of the rows to use. Of rows with equal timestamps ``t_ns`` (N,), only the last is used.
 
     ``rows`` (N,): row numbers in the file ``source``. ``rules``: if given, errors name the key that sorts the rows. If
     rows are dropped, a warning is appended to ``warnings``. Raises InputError if a timestamp precedes the previous one.
@@ -52,11 +52,12 @@ def in_order(
 def increments_in_order(
     source: object, rows: Integers, t_ns: Integers, moves: Array, warnings: list[Notice], rules: RowRules | None = None
 ) -> tuple[Integers, Array]:
-    """Compose the odometry increments that have equal timestamps ``t_ns`` (N,).
+    """Return the distinct timestamps (M,) [ns] of odometry increments, and the increments (M, 3 or 4).
 
     ``moves`` (N, 3 or 4): the motion (x, y, heading) [m, m, rad] since the previous row, in the body frame of that row.
-    The optional fourth column is the part [s] of this time without odometry. Returns the distinct timestamps (M,) and
-    their motions (M, 3 or 4). ``rows`` (N,): row numbers in ``source``. Raises InputError if the timestamps decrease.
+    The optional fourth column is the part [s] of this time without odometry. Increments with equal timestamps ``t_ns``
+    (N,) are composed, with a warning in ``warnings``. ``rows`` (N,): row numbers in the file ``source``. Raises
+    InputError if the timestamps decrease.
     """
     _require_order(source, rows, t_ns, rules)
     last, out = composed(t_ns, moves[:, :3])
@@ -93,10 +94,11 @@ def arrivals(
     *,
     max_late_ns: int | None = MAX_LATE_NS,
 ) -> None:
-    """Check that no timestamp ``t_ns`` (N,) is more than ``max_late_ns`` older than a previous one in the file.
+    """Check that no timestamp in ``t_ns`` (N,) [ns] is older than a previous one by more than ``max_late_ns`` [ns].
 
-    Rows with smaller delays add a warning to ``warnings``. Raises InputError for a larger delay. If ``max_late_ns`` is
-    None, any delay is valid. ``rows`` (N,): row numbers in the file ``source``.
+    If a timestamp is late by less, a warning is appended to ``warnings``. ``max_late_ns`` None: any delay is valid.
+    ``rows`` (N,): row numbers in the file ``source``. ``rules``: if given, errors name the key that sorts the rows.
+    Raises InputError for a larger delay.
     """
     newest = np.maximum.accumulate(t_ns) if len(t_ns) else t_ns
     late = newest - t_ns
@@ -122,10 +124,11 @@ def last_in_order(
     names: Sequence[str] | None = None,
     rules: RowRules | None = None,
 ) -> Integers:
-    """Return the indices (M,) of the rows to keep: of rows with equal timestamps ``t_ns`` (N,) only the last.
+    """Return the indices (M,) of the rows to use. Of rows with equal timestamps ``t_ns`` (N,), only the last is used.
 
-    If ``names`` gives the landmark of each row, rows with different landmarks are all kept. ``rows`` (N,): row numbers
-    in the file ``source``. Raises InputError if a timestamp is more than 0.5 s older than a previous one.
+    ``names``: the landmark of each row. If given, rows with equal timestamps and different landmarks are all used.
+    ``rows`` (N,): row numbers in the file ``source``. Rows out of order add a warning to ``warnings``. Raises
+    InputError if a timestamp is more than 0.5 s older than a previous one.
     """
     arrivals(source, rows, t_ns, warnings, rules)
     keys: Iterable[Hashable] = t_ns.tolist() if names is None else zip(t_ns.tolist(), names, strict=True)
@@ -139,16 +142,19 @@ def last_in_order(
 
 
 def stamps(source: object, rows: Integers, t: Array) -> Integers:
-    """Convert timestamps ``t`` (N,) [s] to nanoseconds. Raises InputError at a row with a time that is out of range."""
+    """Return the timestamps ``t`` (N,) [s] in nanoseconds. Raises InputError at the first that is out of range.
+
+    ``rows`` (N,): row numbers in the file ``source``, for the error.
+    """
     SECONDS.require(source, rows, t, "time")
     return np.asarray(np.rint(t * 1e9).astype(np.int64))
 
 
 def absolute(t: Array, t0_ns: int) -> Integers:
-    """Convert times (N,) [s] since ``t0_ns`` [ns] to timestamps [ns]."""
+    """Return timestamps (N,) [ns] for times ``t`` (N,) [s] that count from ``t0_ns`` [ns]."""
     return np.asarray(np.rint(t * 1e9).astype(np.int64) + t0_ns)
 
 
 def seconds(t_ns: Integers, t0_ns: int) -> Array:
-    """Convert timestamps (N,) [ns] to times [s] since ``t0_ns`` [ns]."""
+    """Return times (N,) [s] since ``t0_ns`` [ns] for timestamps ``t_ns`` (N,) [ns]."""
     return np.asarray((t_ns - t0_ns) / 1e9, dtype=float)

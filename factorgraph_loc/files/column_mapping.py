@@ -60,7 +60,7 @@ class ColumnMapping(FileModel):
     """which rows to read: by column of the file, the value or the list of possible values"""
 
     def chosen(self) -> dict[str, set[str]]:
-        """Return the setting ``where`` with values as texts: by column, the values of the rows to read."""
+        """Return the setting ``where`` as texts: for each column, the values that rows to read may have in it."""
         return {
             column: {_text(value) for value in (values if isinstance(values, tuple) else (values,))}
             for column, values in self.where.items()
@@ -123,8 +123,7 @@ def _mapped(
 ) -> Cells:
     """Return the cells of a file by field. ``columns``: the cells by column name. ``available``: all column names.
 
-    ``unwanted``, ``passed`` and ``unread`` are fields of :class:`Cells`.
-    """
+    ``unwanted``, ``passed`` and ``unread`` are fields of :class:`Cells`."""
     fields = {field: columns[name] for field, name in mapping.columns.items() if name in columns}
     read = {*mapping.columns.values(), *mapping.where}
     left_out = tuple(name for name in available if name not in read)
@@ -139,9 +138,10 @@ def _rules(mapping: ColumnMapping) -> RowRules | None:
 
 
 class TableFolder:
-    """Reads the tables of a folder, and records which rows and columns no mapping reads.
+    """Reads the tables of a log from a folder, and records which rows and columns are read.
 
-    ``warnings``: warnings about the content of the tables. Several mappings may read the same file.
+    A mapping assigns columns of a file to fields, and several mappings may read the same file. ``warnings``: a list of
+    warnings about the content of the tables.
     """
 
     def __init__(self, path: Path) -> None:
@@ -154,18 +154,20 @@ class TableFolder:
         return inside(self.path, name, self.path)
 
     def read(self, mapping: TimedMapping, shapes: Sequence[Collection[str]], columns: Mapping[str, Column]) -> Cells:
-        """Read the file that a mapping names, and record its rows and columns as read. Return the valid cells.
+        """Return the valid cells of the file that ``mapping`` names, and record its rows and columns as read.
 
-        ``shapes``: alternative sets of fields; the mapping has all fields of one. ``columns``: describes each field.
+        ``shapes``: alternative sets of fields; the mapping must have all fields of one set. ``columns``: describes each
+        field. Raises InputError at an invalid cell, unless ``mapping`` skips invalid rows.
         """
         return self.record_read(read_mapped(self.file(mapping.file), mapping, shapes), mapping, columns)
 
     def record_read(
         self, cells: Cells, mapping: TimedMapping, columns: Mapping[str, Column], more: Sequence[Fault] = ()
     ) -> Cells:
-        """Record that the rows and columns of ``cells`` are read. Return the valid cells, sorted if ``mapping`` sorts.
+        """Record that the rows and columns of ``cells`` are read. Return the valid cells, by time if ``mapping`` sorts
+        rows.
 
-        ``columns``: the description of each field. ``more``: further invalid cells.
+        ``columns``: the description of each field. ``more``: invalid cells that the caller has found in addition.
         """
         if cells.passed:
             sentence = "{source}: {objects} objects that lack keys in columns are skipped"
@@ -201,7 +203,7 @@ class TableFolder:
 
 
 def in_case(epcs: Sequence[str], case: EpcCase) -> list[str]:
-    """Convert EPCs to the letter case ``case``. If it is "ascii-hex", decode hexadecimal EPCs to ASCII if possible."""
+    """Return EPCs in the letter case ``case``. For "ascii-hex", decode hexadecimal EPCs to ASCII if possible."""
     if case == "as written":
         return list(epcs)
     if case == "ascii-hex":
@@ -220,8 +222,7 @@ def text_of_hex(digits: str) -> str:
 def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]) -> Cells:
     """Read the columns of a CSV file that ``mapping`` assigns to fields, in the rows that ``where`` selects.
 
-    Raises InputError if all columns of one entry of ``needed`` are missing.
-    """
+    Raises InputError if all columns of one entry of ``needed`` are missing."""
     numbered = [(row, line) for row, line in enumerate(read_text(path).splitlines(), start=1) if line.strip()]
     comments, content = split_comments(numbered)
     if not content:
@@ -275,7 +276,10 @@ def split_comments(lines: Sequence[tuple[int, str]]) -> tuple[list[tuple[int, st
 
 
 def parsed(path: Path, lines: Sequence[tuple[int, str]], separator: str) -> Iterator[tuple[int, list[str]]]:
-    """Split the numbered ``lines`` of a CSV file at ``separator``. Yield the line number and the cells of each row."""
+    """Split the lines of a CSV file at ``separator``. Yield the line number and the cells of each row.
+
+    ``lines``: line numbers and texts.
+    """
     if separator == " ":  # any number of blanks separates columns
         return ((row, line.split()) for row, line in lines)
     rows = csv_rows(path, lines, delimiter=separator, skipinitialspace=True)
@@ -301,11 +305,10 @@ def _require_columns(
 
 
 def _read_json_lines(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]) -> Cells:
-    """Read the mapped columns of a file in which each line is a JSON object or a list of JSON objects.
+    """Read the mapped columns of a file. Each line of the file is a JSON object or a list of JSON objects.
 
-    Objects that ``where`` excludes or that lack a ``needed`` column are ignored. Raises InputError if a needed column
-    is missing in all objects.
-    """
+    Objects that ``where`` excludes or that lack a ``needed`` column are ignored. Raises InputError if all objects lack
+    one."""
     unread: list[tuple[int, str]] = []
     objects = list(_objects(path, unread))
     where = mapping.chosen()
@@ -335,8 +338,7 @@ def _read_json_lines(path: Path, mapping: ColumnMapping, needed: Sequence[Altern
 def _wrong_value(path: Path, row: int, entry: Mapping[str, Any], fields: Sequence[str], texts: Collection[str]) -> str:
     """Return an error message about the first field of the object ``entry`` with a value of a wrong type, or "".
 
-    ``fields``: the fields to check. ``texts``: those fields that must be texts. ``row``: line number of the object.
-    """
+    ``fields``: the fields to check. ``texts``: those fields that must be texts. ``row``: line number of the object."""
     for name in fields:
         value = entry.get(name)
         if isinstance(value, list | bool) or (name in texts and not isinstance(value, str | None)):
@@ -355,9 +357,8 @@ def _text(value: Any) -> str:
 def _objects(path: Path, unread: list[tuple[int, str]]) -> Iterator[tuple[int, dict[str, Any]]]:
     """Yield the line number and the content of each object in a file of JSON lines.
 
-    A nested value has the keys that lead to it, joined by dots, as its key. The number and the error of each invalid
-    line are appended to ``unread``.
-    """
+    Nested objects are flattened: the value of ``b`` in ``a`` has the key ``a.b``. The number and the error of each
+    invalid line are appended to ``unread``."""
     for row, line in enumerate(read_text(path).splitlines(), start=1):
         if not line.strip():
             continue

@@ -49,7 +49,7 @@ COVARIANCES = dict(zip(("cov_xx", "cov_xy", "cov_xh", "cov_yy", "cov_yh", "cov_h
 
 
 def symmetric(upper: Sequence[Array]) -> Array:
-    """Return symmetric matrices (N, 3, 3). ``upper``: six arrays (N,), the entries at the indices :data:`UPPER`."""
+    """Return symmetric matrices (N, 3, 3). ``upper``: their entries xx, xy, xz, yy, yz, zz, each an array (N,)."""
     full = np.empty((len(upper[0]), 3, 3))
     for values, (i, j) in zip(upper, UPPER, strict=True):
         full[:, i, j] = full[:, j, i] = values
@@ -78,7 +78,7 @@ class Column:
 
     @cached_property
     def measured(self) -> Column:
-        """The column as an attribute of a ``Stream``: ``name`` is ``field``, ``low`` is at least ``left_out_below``."""
+        """The column as described for a ``Stream``: ``name`` is ``field``, ``low`` is at least ``left_out_below``."""
         return replace(self, name=self.field or self.name, low=max(self.low, self.left_out_below))
 
     @property
@@ -120,7 +120,8 @@ class Column:
         return (self if factor == 1.0 else replace(self, units={name: 1.0}, low=low, high=high)), factor
 
     def outside(self, values: Array | Integers) -> NDArray[np.bool_]:
-        """Return a mask of the invalid ``values``, given in :attr:`unit`. NaN is invalid unless ``may_lack`` is set."""
+        """Return a mask of the invalid ``values``, which are in :attr:`unit`. NaN is invalid unless ``may_lack`` is
+        set."""
         bad = ~((values >= self.low) & (values <= self.high))
         if self.kind == "whole":
             bad |= values != np.floor(values)
@@ -172,10 +173,9 @@ class Table:
 
 
 def find_outlier(tables: Sequence[Array | Integers], most: float) -> tuple[int, int, float] | None:
-    """Find an outlier among timestamps. ``tables``: arrays of timestamps.
+    """Return the timestamp that is farthest from the median: the index of its table, its row, and the median.
 
-    Returns the index of the table and the row of the timestamp that is farthest from the median, and the median.
-    Returns None if no two timestamps differ by more than ``most``.
+    ``tables``: arrays of timestamps. Returns None if no two timestamps differ by more than ``most``, in the same unit.
     """
     stamps = np.sort(np.concatenate(tables))
     if not len(stamps) or stamps[-1] - stamps[0] <= most:
@@ -221,7 +221,8 @@ def number(
 
 
 def within(name: str, units: Mapping[str, float], most: float, doc: str) -> Column:
-    """Return a :class:`Column` of numbers from ``-most`` to ``most``. The other arguments are values of its fields."""
+    """Return a :class:`Column` of numbers from ``-most`` to ``most``. ``units``: factors that convert a unit to the
+    first unit, by its name. ``doc``: meaning of the column."""
     return number(name, units, -most, most, doc)
 
 

@@ -20,9 +20,10 @@ TOO_LARGE = f"has too many pixels, expected at most {PIXELS:,}"
 
 @contextmanager
 def pillow_image(file: BinaryIO, source: object) -> Iterator[Image.Image]:
-    """Open an image with Pillow in this block. The pixels are decoded when they are first used.
+    """Open an image with Pillow in this block, and yield it. The pixels are decoded when they are first used.
 
-    Raises InputError with ``source`` if the image is invalid, has more than :data:`~bounded.PIXELS` pixels, or cannot be decoded.
+    Raises InputError with ``source`` if the image is invalid, has more than :data:`~bounded.PIXELS` pixels, or cannot
+    be decoded.
     """
     with foreign(source, NO_IMAGE), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # Pillow's warnings about large sizes and damaged metadata

@@ -59,7 +59,7 @@ class InUnit:
 
 
 def add_fields(model: type[BaseModel], fields: Mapping[str, tuple[Any, Any]], *, after: str) -> None:
-    """Add fields to a model class. Use this for fields that depend on the installed sensors.
+    """Add fields to the pydantic class ``model``, in place. Use this for fields that depend on the installed sensors.
 
     ``fields``: type and default of each new field by name. ``after``: name of the field that they follow.
     """
@@ -78,9 +78,9 @@ Coordinate = Annotated[float, Field(ge=-FARTHEST, le=FARTHEST), InUnit("m")]
 
 
 def bounds(metadata: Sequence[Any]) -> tuple[float, float]:
-    """Return the inclusive lower and upper bound of a numeric field. A missing bound is infinite.
+    """Return the inclusive lower and upper bound of a numeric field. A missing bound is -inf or inf.
 
-    ``metadata``: the field's metadata of pydantic.
+    ``metadata``: the attribute ``metadata`` of a pydantic ``FieldInfo``.
     """
     low, high = -math.inf, math.inf
     for entry in metadata:
@@ -226,7 +226,7 @@ def nearest(word: str, known: list[str]) -> str:
 
 
 def similar(word: str, known: list[str]) -> list[str]:
-    """Return a list with the word of ``known`` that is most similar to ``word``, or [] if none is similar."""
+    """Return a list with the word of ``known`` that is most similar to ``word``, or an empty list."""
     short = [name for name in known if len(name) <= NAME][:MOST_NAMES]
     return difflib.get_close_matches(word, short, n=1, cutoff=0.5) if len(word) <= NAME else []
 
@@ -257,14 +257,14 @@ def flattened(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[st
 
 
 def inside(root: Path, name: str, source: object, *others: Path, expected: str = "a path below it") -> Path:
-    """Resolve a path that a file contains, and check that it does not leave the permitted folders.
+    """Return the absolute path that ``name`` refers to. Raises InputError if it leaves the permitted folders.
 
-    ``name``: the path. ``source``: the file that contains it, for messages. ``root`` and ``others``: the permitted
-    folders. ``expected``: end of the message if the path leaves them.
+    ``name``: a path in the file ``source``. ``root`` and ``others``: the permitted folders. ``expected``: end of the
+    error.
 
-    A relative path is taken from the first of the folders that contains it, or else from ``root``. Links are
-    resolved. The path need not exist. Raises InputError if the path leaves all folders (by dots, as an absolute path or
-    by a link), or is neither a regular file nor a folder. Raises NoFileNameError if no file can have that name.
+    A relative path is taken from the first of the folders that contains it, or else from ``root``. Links are resolved.
+    The path need not exist. Raises InputError also if the path is neither a regular file nor a folder. Raises
+    NoFileNameError if no file can have that name.
     """
     try:
         folders = [os.path.realpath(folder) for folder in (root, *others)]
@@ -298,7 +298,7 @@ def file_name(name: str) -> str:
 def replacing(path: Path) -> Iterator[Path]:
     """Yield a temporary file next to ``path``. It is moved to ``path`` when the block ends without an error.
 
-    An OSError in the block is raised with ``path`` as its file name, which the error for a full disk would lack.
+    An OSError in the block is raised with ``path`` as its file name.
     """
     try:
         with temporary_file(path) as temporary:

@@ -57,7 +57,7 @@ class RowRules(FileModel):
         warnings: list[Notice],
         unread: Sequence[tuple[int, str]] = (),
     ) -> Integers:
-        """Return the indices of the rows without a fault. If rows are skipped, a warning is appended to ``warnings``.
+        """Return the indices (M,) of the rows without a fault. Skipped rows add a warning to ``warnings``.
 
         ``rows`` (N,): row numbers in the file ``source``. ``faults``: the invalid cells. ``unread``: row number and
         error message of each further row that could not be split into cells. Raises InputError at the first fault if
@@ -83,9 +83,10 @@ class RowRules(FileModel):
         return np.flatnonzero(~wrong)
 
     def in_time(self, source: object, rows: Integers, t_ns: Integers, warnings: list[Notice]) -> Integers:
-        """Return indices (N,) that sort the rows by timestamp ``t_ns`` (N,), or 0 to N - 1 if ``order`` is "refuse".
+        """Return the indices (N,) that sort timestamps ``t_ns`` (N,). They are 0 to N - 1 if ``order`` is "refuse".
 
-        If rows are out of order, a warning is appended to ``warnings``. ``rows`` (N,): row numbers in ``source``."""
+        If rows are out of order, a warning is appended to ``warnings``. ``rows`` (N,): row numbers in ``source``.
+        """
         late = np.maximum.accumulate(t_ns) - t_ns if len(t_ns) else t_ns
         if self.order == "refuse" or not late.any():
             return np.arange(len(t_ns))
@@ -104,12 +105,12 @@ class RowRules(FileModel):
 
     @property
     def skipping(self) -> str:
-        """The end of an error message, with the setting that skips invalid rows."""
+        """The end of an error message: how to set the option that skips invalid rows."""
         return f'; bad_rows = "skip" in {self.PLACE} skips such rows'
 
     @property
     def sorting(self) -> str:
-        """The end of an error message, with the setting that sorts rows."""
+        """The end of an error message: how to set the option that sorts rows by time."""
         return f'; order = "sort" in {self.PLACE} sorts the rows'
 
 

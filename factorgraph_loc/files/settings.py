@@ -50,8 +50,7 @@ class _Part:
     """One alternative of the type annotation of a field, such as ``float`` in ``list[float] | None``.
 
     ``metadata``: bounds and units, as pydantic objects. ``path``: end of the key, with ".*" for each enclosing dict.
-    ``count``: 1 if the type is no list, or else the length of the list; 0 if any length is valid.
-    """
+    ``count``: 1 if the type is no list, or else the length of the list; 0 if any length is valid."""
 
     type: Any
     metadata: tuple[Any, ...]
@@ -147,8 +146,7 @@ def _is_model(kind: Any) -> bool:
 def _own(key: str, parts: list[_Part], setting: Setting) -> Iterator[Setting]:
     """Yield the description of the setting ``key``, but of a table only if it has a docstring.
 
-    ``parts``: the alternatives of its type. ``setting``: a description with key, default and meaning, to complete.
-    """
+    ``parts``: the alternatives of its type. ``setting``: a description with key, default and meaning, to complete."""
     own = [part for part in parts if not _is_model(part.type)]
     if not own:
         if setting.meaning:

@@ -13,7 +13,7 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def one_or_several(kind: type[BaseModel]) -> Any:
-    """Return the type annotation of a field that contains the settings of one sensor, of several by name, or None.
+    """Return a type annotation for a field with the settings of one sensor, of several sensors by name, or None.
 
     ``kind``: class of the settings. In TOML, a field ``gps`` is a table ``[gps]``, or tables ``[gps.NAME]``.
     """
@@ -45,9 +45,9 @@ def is_name(name: str) -> bool:
 
 
 def by_name(section: str, value: Model | Mapping[str, Model] | None) -> dict[str, Model]:
-    """Return the models in a field of the type :func:`one_or_several`, by their keys.
+    """Return the settings in a field with the annotation :func:`one_or_several`, by their keys.
 
-    ``section``: name of the field. The key of a single model is ``section``. Several models have keys ``section.NAME``.
+    ``section``: name of the field. The key of a single sensor is ``section``; of several, ``section.NAME``.
     """
     if isinstance(value, Mapping):
         return {f"{section}.{name}": model for name, model in value.items()}

@@ -8,20 +8,17 @@ OTHERS = (".rig.toml", ".world.toml", ".reader.toml")  # suffixes of TOML files 
 
 
 def manifests() -> dict[str, Path]:
-    """Return the installed manifests: the file by name, sorted by name."""
+    """Return the files that describe the data sets of this package, by the name of the data set."""
     return {file.stem: file for file in sorted(folder().glob("*.toml")) if not file.name.endswith(OTHERS)}
 
 
 def rigs() -> dict[str, Path]:
-    """Return the installed rigs: the file by name, sorted by name."""
+    """Return the rig files in this package by name. A rig file has the settings of a robot and its sensors."""
     return {file.name.removesuffix(".rig.toml"): file for file in sorted(folder().glob("*.rig.toml"))}
 
 
 def readers() -> dict[str, Path]:
-    """Return the installed reader descriptions: the file by name, sorted by name.
-
-    A reader description has the settings for reading the tables of a known program.
-    """
+    """Return the files with settings for tables of known programs, by the name of the reader of these tables."""
     return {file.name.removesuffix(".reader.toml"): file for file in sorted(folder().glob("*.reader.toml"))}
 
 

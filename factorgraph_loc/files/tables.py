@@ -66,8 +66,8 @@ def rows_of_length(
 def read_cells(path: Path, tables: Sequence[Table], rules: RowRules | None = None) -> tuple[Cells, tuple[Column, ...]]:
     """Read a CSV file that contains one of several possible ``tables``.
 
-    Returns the cells and the columns of the table that the header of the file fits best. Raises InputError if the
-    content is invalid. ``rules``: whether invalid rows are skipped. None: they are errors.
+    Returns the cells, and the descriptions of the columns of the table that fits the header of the file best. Raises
+    InputError if the content is invalid. ``rules``: whether invalid rows are skipped. None: they are errors.
     """
     lines = list(enumerate(io.StringIO(read_text(path), newline=""), start=1))
     parsed = csv_rows(path, lines)
@@ -81,10 +81,10 @@ def read_cells(path: Path, tables: Sequence[Table], rules: RowRules | None = Non
 
 
 def columns_in(path: Path, header: Sequence[str], tables: Sequence[Table]) -> tuple[Column, ...]:
-    """Return the columns to read from a file, by the names in its ``header``.
+    """Return the columns to read from a file with the column names ``header``.
 
-    They belong to that table of ``tables`` which has most columns in common with the header. Raises InputError if a
-    required column of the table is missing, or ``header`` has a name twice.
+    They are the columns of that table of ``tables`` which has the most columns in common with ``header``. Raises
+    InputError if a required column of this table is missing, or if ``header`` has a name twice.
     """
     if len(set(header)) < len(header):
         raise bad_field(path, "header", ",".join(header), "each column once", row=1)
@@ -186,7 +186,8 @@ class TableRows:
 
     @classmethod
     def of(cls, cells: Cells, columns: Iterable[Column], t_ns: Integers) -> Self:
-        """Parse the cells of the given columns. ``t_ns`` (N,): timestamps of the rows. Raises InputError at an invalid cell."""
+        """Return the rows with parsed values of ``cells`` in the given columns. ``t_ns`` (N,): timestamps of the rows
+        [ns]. Raises InputError at an invalid cell."""
         described = list(columns)
         numbers = {column.name: cells.numbers(column.name, column) for column in described if column.kind in NUMBERS}
         names = {column.name: cells.names(column.name, column) for column in described if column.kind in NAMES}
@@ -206,10 +207,10 @@ class TableRows:
 
 
 def read_table(path: Path, tables: Sequence[Table], rules: RowRules, warnings: list[Notice]) -> TableRows:
-    """Read a CSV or Parquet file that contains one of several possible ``tables``. Other columns of the file are ignored.
+    """Return the rows of a CSV or Parquet file, which contains one of several possible ``tables``.
 
-    Raises InputError if a value is missing, is not a number, or is out of bounds, unless ``rules`` skip such rows. If
-    rows are skipped or sorted, a warning is appended to ``warnings``.
+    Columns that the table lacks are ignored. Raises InputError if a value is missing, is not a number, or is out of
+    bounds, unless ``rules`` skip such rows. If rows are skipped or sorted, a warning is appended to ``warnings``.
     """
     with limited_memory(path, path.stat().st_size if path.is_file() else 0):
         cells, columns = (_cells_of_parquet if path.suffix == ".parquet" else read_cells)(path, tables, rules)

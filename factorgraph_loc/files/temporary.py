@@ -42,7 +42,7 @@ def temporary_folder(path: Path) -> AbstractContextManager[Path]:
 
 
 def of_system(name: str) -> Path:
-    """Return the path of ``name`` in the temporary folder of the system."""
+    """Return the path ``name`` in the temporary folder of the system, such as ``/tmp/NAME``. Nothing is created."""
     return Path(tempfile.gettempdir()) / name
 
 
@@ -148,9 +148,10 @@ def new_below(folder: Path, name: str) -> Path:
 
 
 def require_free(out: Path, names: Iterable[str], *, overwrite: bool) -> None:
-    """Raise InputError if ``out`` is a file or, unless ``overwrite`` is set, a folder with one of the files ``names``.
+    """Raise InputError if results cannot be written to the folder ``out``.
 
-    Temporary files of ended processes are removed from ``out``, ``out/plots`` and the parent of ``out``.
+    That is the case if ``out`` is a file, or if it has one of the files ``names`` and ``overwrite`` is False. Temporary
+    files of ended processes are removed from ``out``, ``out/plots`` and the parent of ``out``.
     """
     for folder in (out.parent, out, out / "plots"):
         sweep(folder)

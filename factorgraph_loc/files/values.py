@@ -24,7 +24,7 @@ FEW = 30  # maximum number of values that a Python loop checks faster than NumPy
 def seconds_of(where: str, value: object, name: str = "t") -> float:
     """Return the time ``value`` [s] as a float. Raises InputError if it is not a number or out of range.
 
-    ``where``: the object that has the value, and ``name``: the field of the object; both are for the message.
+    ``where``: the object that has the value. ``name``: the field of the object. The error names both.
     """
     if type(value) is float and SECONDS.low <= value <= SECONDS.high:
         return value
@@ -76,14 +76,18 @@ def within(where: str, column: Column, value: object, shape: tuple[int, ...]) ->
 def names(where: str, field: str, value: object) -> tuple[str, ...]:
     """Return the names in ``value`` as a tuple. Raises InputError if ``value`` is not a list of texts.
 
-    ``where``, ``field``: the object and its field that has the value, for the message."""
+    ``where``: the object that has the value. ``field``: the field of the object. The error names both.
+    """
     if isinstance(value, str) or not isinstance(value, Sequence) or not all(isinstance(name, str) for name in value):
         raise bad_field(where, field, value, "names")
     return tuple(value)
 
 
 def items_of(where: str, field: str, values: object) -> tuple[Any, ...]:
-    """Return the items of ``values`` as a tuple. Raises InputError if ``values`` is a text or cannot be iterated."""
+    """Return the items of ``values`` as a tuple. Raises InputError if ``values`` is a text or cannot be iterated.
+
+    ``where``: the object that has the values. ``field``: the field of the object. The error names both.
+    """
     items = None
     if isinstance(values, Iterable) and not isinstance(values, str):
         with contextlib.suppress(TypeError):  # raised by a zero-dimensional array
@@ -94,9 +98,10 @@ def items_of(where: str, field: str, values: object) -> tuple[Any, ...]:
 
 
 def integers(where: str, column: Column, value: object, count: int) -> NDArray[np.int64]:
-    """Return ``value`` as an array of integers. ``where``: the object that has the value, for the message.
+    """Return ``value`` as an array of ``count`` integers. ``where``: names the object with the value in errors.
 
-    Raises InputError unless ``value`` consists of ``count`` whole numbers within the bounds of ``column``."""
+    Raises InputError unless ``value`` consists of ``count`` whole numbers within the bounds of ``column``.
+    """
     array = numbers(where, column.name, value)
     if array.shape != (count,) or (count and np.asarray(value).dtype.kind not in "iu"):
         raise bad_field(where, column.name, value, f"{count} whole numbers")

@@ -43,8 +43,7 @@ def require_bounds(log: Log) -> None:
 def _require(where: str, column: Column, t: Array, values: Array) -> None:
     """Raise InputError at the first of ``values`` (N,) that is outside of the bounds of ``column`` by more than rounding.
 
-    ``where``: the beginning of the error. ``t`` (N,): the times of the values [s].
-    """
+    ``where``: the beginning of the error. ``t`` (N,): the times of the values [s]."""
     low, high = column.low - TOLERANCE * abs(column.low), column.high + TOLERANCE * abs(column.high)
     bad = replace(column, low=low, high=high).outside(values)
     if bad.any():
@@ -72,7 +71,7 @@ def require_one_span(log: Log) -> None:
 
 
 def long_gaps(t: Array) -> tuple[tuple[float, float], ...]:
-    """Return the start and the length [s] of each gap above :data:`LONG_GAP` between ascending timestamps ``t`` (N,) [s]."""
+    """Return (start, length) [s] of each gap above :data:`LONG_GAP` between ascending timestamps ``t`` (N,) [s]."""
     steps = np.diff(t)
     return tuple((float(t[i]), float(steps[i])) for i in np.flatnonzero(steps > LONG_GAP + ROUNDING))
 
@@ -88,10 +87,10 @@ def gap_warnings(name: str, gaps: Sequence[tuple[float, float]]) -> list[Notice]
 
 
 def without_false_headings(log: Log) -> Log:
-    """Return the log. Mark the headings of its reference as invalid if they never change although the robot turns.
+    """Return the log, without the headings of its reference trajectory if they never change although the robot turns.
 
-    Systems that measure only positions may report a constant orientation. The robot turns if the odometry turns by
-    more than :data:`TURNED`.
+    The robot turns if the odometry turns by more than :data:`TURNED`. Systems that measure only positions may report a
+    constant orientation.
     """
     stream, reference = log.streams.get("odometry"), log.reference
     if reference is None or not reference.has_heading or len(reference.t) < 2 or np.ptp(reference.poses[:, 2]) > 1e-9:
@@ -112,7 +111,7 @@ def without_false_headings(log: Log) -> Log:
 
 
 def log_warnings(log: Log) -> list[Notice]:
-    """Return warnings about gaps in the odometry, measurements before it, and landmarks that the map lacks.
+    """Return warnings about gaps in odometry, measurements before it, and observed landmarks that the map lacks.
 
     Raises InputError if the log has measurements but no odometry.
     """

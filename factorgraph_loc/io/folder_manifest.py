@@ -58,10 +58,10 @@ class _Roles:
 
 
 def manifest_of_folder(tables: Path, folder: Path) -> Proposal:
-    """Propose a manifest, a TOML file that describes how to read a log, for the folder ``tables``.
+    """Return a proposed manifest of the folder ``tables``. A manifest is a TOML file that describes how to read a log.
 
-    The manifest is to be saved in ``folder`` if ``tables`` is below ``folder``, else in the folder that contains
-    ``tables``. Raises InputError if no file in ``tables`` is a table with times.
+    Nothing is written. Paths in the manifest are relative to ``folder`` if ``tables`` is below ``folder``, else to the
+    folder that contains ``tables``. Raises InputError if no file in ``tables`` is a table with times.
     """
     path, folder = Path(os.path.realpath(tables)), folder.resolve()
     guesses = _guesses(path)
@@ -145,8 +145,7 @@ def _map_in_parent(path: Path, roles: _Roles) -> list[str]:
 def _map_settings(role: str, roles: _Roles) -> dict[str, Any]:
     """Return the settings of a world file for the table of the map. ``role``: "tags" or "landmarks".
 
-    If the EPCs in the map and in the reads differ in letter case, a setting converts the EPCs of the map.
-    """
+    If the EPCs in the map and in the reads differ in letter case, a setting converts the EPCs of the map."""
     table, reads = roles.tables[role], roles.tables.get("rfid")
     settings = table.mapping(FIELDS[role])
     if role == "tags" and reads is not None:
@@ -170,8 +169,7 @@ def _guesses(folder: Path) -> list[Guess]:
 def _roles(guesses: Sequence[Guess]) -> _Roles:
     """Assign a role to each of the tables ``guesses``. Return the roles.
 
-    A table of poses is the reference if its file name suggests ground truth, or if another table is the odometry.
-    """
+    A table of poses is the reference if its file name suggests ground truth, or if another table is the odometry."""
     out = _Roles()
     poses = [g for g in guesses if g.has("t", "x", "y") and not g.has("epc") and not g.has("landmark")]
     truths = [g for g in poses if TRUTH.search(g.name)]
@@ -245,8 +243,7 @@ def _add_sizes(settings: dict[str, Any], table: Guess, sides: Sequence[str], rol
     """Add the distance between the wheels, and the distance per encoder count, to the ``settings`` of odometry.
 
     ``table``: the table of odometry. ``sides``: its fields of the wheels. ``roles``: the tables of all roles, and remarks.
-    The two distances are estimated from the reference. Without a reference they are examples, and a remark says so.
-    """
+    The two distances are estimated from the reference. Without a reference they are examples, and a remark says so."""
     settings["track"] = TRACK
     if sides[0] != "left":
         if sides[0] in ("left_angle", "left_rate"):
@@ -299,9 +296,8 @@ def _reference(roles: _Roles, path: Path) -> Trajectory | None:
 def _lengths(t: Array, counted: Array, reference: Trajectory) -> tuple[float, float]:
     """Return the length of the reference [m], and the sum of the absolute changes of the encoder counts.
 
-    ``t`` (N,): times [s]. ``counted`` (N,): encoder counts. Both results are for the time that the counts and the
-    reference have in common, or for all times if there is none.
-    """
+    ``t`` (N,): times [s]. ``counted`` (N,): encoder counts. Only the time that both have in common is used, if there is
+    any."""
     during = (t >= reference.t[0]) & (t <= reference.t[-1])
     of_reference = (reference.t >= t[0]) & (reference.t <= t[-1])
     if not during.any() or not of_reference.any():
@@ -318,8 +314,7 @@ def _each_second(t: Array, values: Array) -> Array:
 def _counted(table: Guess, sides: Sequence[str]) -> tuple[Array, Array]:
     """Return the counts (N,) of the left wheels and of the right wheels since the first row. Wrapped counters are unwrapped.
 
-    ``sides``: the fields of the wheels in the table.
-    """
+    ``sides``: the fields of the wheels in the table."""
     steps = {name: wheel_steps(table.values(name), 1.0) for name in sides}
     left, right = (np.mean([steps[name] for name in sides if side in name], axis=0) for side in ("left", "right"))
     return np.append(0.0, np.nancumsum(left)), np.append(0.0, np.nancumsum(right))
@@ -330,7 +325,7 @@ def _turns_of(reference: Trajectory) -> Turns:
 
 
 def _turns(role: str, roles: _Roles, path: Path) -> Turns | None:
-    """Return the headings over time in the table with the ``role``, or None if the table has no headings."""
+    """Return the headings over time in the table with the ``role``, such as "odometry", or None without headings."""
     table = roles.tables[role]
     if role == "reference":
         reference = _reference(roles, path)
@@ -349,7 +344,7 @@ def _turns(role: str, roles: _Roles, path: Path) -> Turns | None:
 def _add_clocks(options: dict[str, Any], roles: _Roles, path: Path) -> None:
     """Add clock offsets to the ``options`` of tables with times that do not overlap the times of most other tables.
 
-    An offset aligns the turns of the robot in two tables. If the alignment is unclear, it makes both begin together.
+    An offset aligns the turns of the robot in two tables. If no alignment is clearly best, both tables begin together.
     """
     starts = {role: float(np.nanmin(table.times())) for role, table in roles.tables.items() if table.has("t")}
     ends = {role: float(np.nanmax(roles.tables[role].times())) for role in starts}

@@ -115,7 +115,10 @@ class Guess:
         return self.path.name
 
     def numbers(self, name: str) -> Array | None:
-        """Return the numbers (N,) of a column, NaN for empty cells. Return None if a cell is no number or all are empty."""
+        """Return the numbers (N,) of a column, NaN for empty cells. ``name``: the name of the column in the file.
+
+        Returns None if a cell is not a number, or if all cells are empty.
+        """
         texts = self.columns[name]
         with suppress(ValueError):
             values = np.array([float(t.replace(self.decimal, ".")) if t else np.nan for t in texts])
@@ -144,7 +147,8 @@ class Guess:
         return all(name in self.fields for name in names)
 
     def mapping(self, names: Sequence[str]) -> dict[str, Any]:
-        """Return the settings that describe the table in a manifest. Of its fields, only ``names`` are described."""
+        """Return settings that describe the table in a manifest: file, separators, and columns and units of the fields
+        ``names``."""
         out: dict[str, Any] = {"file": self.name}
         if self.is_tum:
             return out | {"format": "tum"}
@@ -163,9 +167,9 @@ def plain(name: str) -> str:
 
 
 def rank(name: str, known: Sequence[str]) -> int | None:
-    """Return the index of ``name`` in ``known``. A unit at the end of the name is ignored. Returns None if the name is unknown.
+    """Return the index of ``name`` in ``known``, the known spellings in order of preference, or None if it is unknown.
 
-    ``name`` is in lower case and without separators.
+    ``name`` is in lower case and without separators. A unit at its end is ignored.
     """
     return next((known.index(text) for text in (name, UNIT.sub("", name)) if text in known), None)
 
@@ -246,8 +250,7 @@ def _add_time(out: Guess) -> None:
     """Add the column of the time and its unit to ``out``.
 
     Columns with a name such as "time" are tried first, then the first column. The values must be times, or numbers
-    that increase from row to row with few exceptions.
-    """
+    that increase from row to row with few exceptions."""
     names = list(out.columns)
     named = [name for name in names if TIME.match(plain(_split(name)[0]))] if out.header else names[:1]
     for name in [*named, *names[:1]]:

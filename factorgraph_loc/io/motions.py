@@ -49,10 +49,10 @@ class WheelSizes(FileModel):
         return any(size is not None for size in (self.track, self.radius, self.base))
 
     def metres(self, source: object, what: str, *, turns: bool) -> float:
-        """Return the distance on the ground per unit of a wheel's value: the radius for angles, 1 for distances.
+        """Return the distance on the ground per unit of a wheel's value: the radius for angles [rad], 1 for distances.
 
-        ``turns``: True if the values are angles or angular rates. ``source``, ``what``: the file and the setting to
-        name in errors. Raises InputError if a needed size is missing.
+        ``turns``: True if the values are angles or angular rates. ``source``, ``what``: the file and the setting, for
+        errors. Raises InputError if a needed size is missing.
         """
         if self.track is None or (turns and self.radius is None):
             lacking = "track" if self.track is None else "radius"
@@ -60,11 +60,12 @@ class WheelSizes(FileModel):
         return self.radius if turns and self.radius else 1.0
 
     def twists(self, source: object, wheels: Array, warnings: list[Notice]) -> Array:
-        """Return the motion (N, 3) of the robot ahead [m], to the left [m] and about the vertical [rad].
+        """Return the motion (N, 3) of the robot in N time steps: forward [m], to the left [m], and rotation [rad].
 
-        ``wheels`` (N, 2 or 4): the distances [m] of the left, right, rear left and rear right wheels. If they are
-        speeds [m/s], the result is in m/s and rad/s. If the wheels may be mecanum wheels, a warning is appended.
-        Formulas: Taheri, Qiao, Ghaeminezhad, "Kinematic model of a four mecanum wheeled mobile robot".
+        ``wheels`` (N, 2 or 4): the distances [m] that the left, right, rear left and rear right wheels roll. If they
+        are speeds [m/s], the result is in m/s and rad/s. If they may be mecanum wheels, a warning about ``source`` is
+        appended to ``warnings``. Formulas: Taheri, Qiao, Ghaeminezhad, "Kinematic model of a four mecanum wheeled
+        mobile robot".
         """
         assert self.track is not None
         left, right, rear_left, rear_right = (wheels if wheels.shape[1] == 4 else np.hstack((wheels, wheels))).T
@@ -89,10 +90,11 @@ def wheels_of(left: str, count: int) -> tuple[str, ...]:
 def between_poses(
     source: object, t_ns: Integers, poses: Array, warnings: list[Notice], lost_ns: Integers = NO_STAMPS
 ) -> Array:
-    """Return the motions (N - 1, 3) between odometry poses (N, 3) at N timestamps [ns], in the previous body frame.
+    """Return the motions (N - 1, 3) between odometry poses: x, y [m] and heading [rad] in the earlier body frame.
 
-    Where the odometry is reset to the origin, the previous motion is continued, and a warning is appended to
-    ``warnings``. ``lost_ns``: the timestamps at which the device had lost its pose.
+    ``poses`` (N, 3): x, y, heading. ``t_ns`` (N,): their timestamps. At a reset of the odometry to the origin, the
+    motion before it is repeated, and a warning that names the file ``source`` is appended to ``warnings``. ``lost_ns``:
+    timestamps at which the device had no pose.
     """
     moves = se2.between(poses[:-1], poses[1:])
     durations = _durations(t_ns)
@@ -110,9 +112,10 @@ def between_poses(
 def bridge_losses(t_ns: Integers, moves: Array, lost_ns: Integers) -> tuple[Integers, Array]:
     """Return timestamps (M,) [ns] and increments (M, 4) of odometry from a device that sometimes loses its pose.
 
-    ``moves`` (N - 1, 3): motions between valid poses at N timestamps ``t_ns``. ``lost_ns``: timestamps of lost poses.
-    An increment is x, y [m], heading [rad], and the time [s] with a lost pose. Meanwhile the previous motion is
-    continued for at most :data:`HOLD_TIME`. If no pose is lost, the increments are (N, 3).
+    ``moves`` (N - 1, 3): motions x, y [m], heading [rad] between valid poses at the timestamps ``t_ns`` (N,).
+    ``lost_ns``: timestamps without a pose. An increment is the motion since the previous timestamp, and the part [s] of
+    that time without a pose. Without a pose, the last motion is assumed to continue for at most :data:`HOLD_TIME`. If
+    no pose is lost, ``t_ns`` and increments (N, 3) are returned.
     """
     lost = np.setdiff1d(lost_ns[lost_ns > t_ns[0]], t_ns)
     if not len(lost):
@@ -133,24 +136,25 @@ def bridge_losses(t_ns: Integers, moves: Array, lost_ns: Integers) -> tuple[Inte
 
 
 def integrate_velocities(t_ns: Integers, velocities: Array) -> Array:
-    """Integrate velocities (N, 2), forward [m/s] and about the vertical [rad/s]. Return motions (N - 1, 3).
+    """Return the motions (N - 1, 3) between N timestamps: x, y [m] and heading [rad] in the earlier body frame.
 
-    A velocity is constant until the next of the timestamps ``t_ns`` (N,), for at most :data:`HOLD_TIME`.
+    ``velocities`` (N, 2): forward [m/s] and turn rate [rad/s]. A velocity is constant until the next of the timestamps
+    ``t_ns`` (N,), for at most :data:`HOLD_TIME`. After that the robot stands still.
     """
     twists = np.column_stack((velocities[:-1, 0], np.zeros(len(velocities) - 1), velocities[:-1, 1]))
     return np.asarray(se2.exp(twists * np.minimum(np.diff(t_ns) / 1e9, HOLD_TIME)[:, None]))
 
 
 def with_start_row(moves: Array) -> Array:
-    """Return the motions (N - 1, 3) with a row of zeros in front (N, 3), which stands for the start."""
+    """Return ``moves`` (N - 1, 3) with a row of zeros in front (N, 3), so that each of N timestamps has a row."""
     return np.vstack((np.zeros((1, 3)), moves))
 
 
 def wheel_motions(source: object, t_ns: Integers, distances: Array, scales: Array, warnings: list[Notice]) -> Array:
-    """Return the motions (N - 1, W) [m] of W wheels between N timestamps [ns].
+    """Return the distances (N - 1, W) [m] that W wheels roll between N timestamps ``t_ns`` [ns].
 
-    ``distances`` (N, W): the distances of the wheels [m]. ``scales`` (W,): metres per encoder count. Encoders may wrap.
-    At a reset to zero the previous motion is continued, with a warning about the file ``source`` in ``warnings``.
+    ``distances`` (N, W): the total distances [m] by the encoders. ``scales`` (W,): metres per encoder count, to correct
+    encoders that wrap. At a reset to zero the previous motion is repeated, and a warning is appended to ``warnings``.
     """
     steps = np.stack([wheel_steps(distances[:, i], float(scale)) for i, scale in enumerate(scales)], axis=-1)
     durations = _durations(t_ns)
@@ -164,9 +168,10 @@ def wheel_motions(source: object, t_ns: Integers, distances: Array, scales: Arra
 def motion_of_wheel_distances(
     source: object, t_ns: Integers, distances: Array, scales: Array, sizes: WheelSizes, warnings: list[Notice]
 ) -> Array:
-    """Return the motions (N - 1, 3) of a robot from the distances of its wheels. ``sizes``: the sizes of the drive.
+    """Return the motions (N - 1, 3) of a robot from its wheels: x, y [m] and heading [rad] in the earlier body frame.
 
-    ``distances`` (N, W) [m]: of W wheels, at timestamps ``t_ns`` (N,). ``scales`` (W,): metres per encoder count.
+    ``distances`` (N, W): total distances [m] of W = 2 or 4 wheels (left, right, rear left, rear right) at N timestamps.
+    ``scales`` (W,): metres per encoder count. Warnings about the file ``source`` are appended to ``warnings``.
     """
     return se2.exp(sizes.twists(source, wheel_motions(source, t_ns, distances, scales, warnings), warnings))
 
@@ -174,10 +179,11 @@ def motion_of_wheel_distances(
 def motion_of_wheel_speeds(
     source: object, t_ns: Integers, speeds: Array, sizes: WheelSizes, warnings: list[Notice]
 ) -> Array:
-    """Return the speed [m/s] and the turn rate [rad/s] of a robot (N, 2). ``speeds`` (N, 2 or 4): of the wheels [m/s].
+    """Return velocities (N, 2) of a robot from the speeds of its wheels: forward [m/s] and turn rate [rad/s].
 
-    For mecanum wheels, increments (N, 3) are returned instead. A speed is assumed constant until the next of the
-    timestamps ``t_ns`` (N,). ``sizes``: the sizes of the drive. ``source``: the file, for warnings.
+    For mecanum wheels, return increments (N, 3) instead: x, y [m] and heading [rad] since the previous timestamp.
+    ``speeds`` (N, 2 or 4) [m/s]: left, right, rear left, rear right, each constant until the next of the timestamps
+    ``t_ns`` (N,). ``sizes``: the sizes of the drive. Warnings about ``source`` are appended to ``warnings``.
     """
     twists = sizes.twists(source, speeds, warnings)
     if sizes.base is None:
@@ -188,9 +194,10 @@ def motion_of_wheel_speeds(
 def odometry_stream(
     t_ns: Integers, values: Array, t0_ns: int, rules: RowRules, warnings: list[Notice]
 ) -> IncrementStream | VelocityStream:
-    """Return the odometry stream of ``values``: velocities (N, 2) or increments (N, 3 or 4), at N timestamps [ns].
+    """Return odometry from ``values``: velocities (N, 2), or increments (N, 3 or 4) since the previous timestamp.
 
-    ``t0_ns``: timestamp of t = 0. If the ``rules`` skip invalid rows, jumps are skipped, with a warning in ``warnings``.
+    ``t_ns`` (N,): timestamps. ``t0_ns``: timestamp of t = 0. If the ``rules`` skip invalid rows, implausibly fast
+    motions are skipped too, and a warning is appended to ``warnings``.
     """
     t, columns = checks.seconds(t_ns, t0_ns), np.ascontiguousarray(values.T)
     stream = VelocityStream(t, *columns) if len(columns) == 2 else IncrementStream(t, *columns)
@@ -198,9 +205,9 @@ def odometry_stream(
 
 
 def wheel_steps(distances: Array, scale: float) -> Array:
-    """Return the steps (N - 1,) between the distances (N,) of one wheel. ``scale``: distance per encoder count.
+    """Return the differences (N - 1,) of successive distances (N,) of a wheel. ``scale``: distance per encoder count.
 
-    A step is corrected if the encoder wraps to 0. A step must be less than half of the encoder's range.
+    A difference is corrected if the encoder wraps to 0. Limitation: each must be less than half of the encoder's range.
     """
     steps: Array = np.diff(distances)
     ticks = distances / scale
@@ -220,9 +227,8 @@ def _durations(t_ns: Integers) -> Array:
 
 
 def _largest_before(rates: Array, least: float) -> Array:
-    """Return the maximum of the previous rates for each of ``rates`` (N,). It is at least ``least`` and ignores jumps.
-
-    A jump is a rate above :data:`FASTER` times the maximum."""
+    """Return, for each of ``rates`` (N,), the maximum of the rates before it, but at least ``least``. Jumps are
+    ignored: rates above :data:`FASTER` times the maximum before them."""
     out, most = np.empty(len(rates)), least
     for i, rate in enumerate(rates.tolist()):
         out[i] = most
@@ -232,9 +238,9 @@ def _largest_before(rates: Array, least: float) -> Array:
 
 
 def _continued(source: object, t_ns: Integers, steps: Array, resets: Integers, warnings: list[Notice]) -> Array:
-    """Return the ``steps`` (N - 1, D). The steps with indices ``resets`` are replaced by the previous motion.
+    """Return the ``steps`` (N - 1, D), with the steps at the indices ``resets`` replaced by the motion before them.
 
-    If there are resets, a warning about the file ``source`` is appended to ``warnings``."""
+    If there are resets, a warning that names the file ``source`` is appended to ``warnings``."""
     durations = _durations(t_ns)
     for i in resets.tolist():
         previous = steps[i - 1] / durations[i - 1] if i else np.zeros(steps.shape[1])
@@ -248,7 +254,10 @@ def _continued(source: object, t_ns: Integers, steps: Array, resets: Integers, w
 
 
 def with_wheels_of(rig: Rig | None, options: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the options of a reader. If they describe wheels, the radius and track of the rig replace those in the options."""
+    """Return the ``options`` of a reader, with the wheel radius and track of ``rig`` instead of those in the options.
+
+    Returns ``options`` unchanged if they do not describe wheels, or if ``rig`` is None or has no wheels.
+    """
     drive = None if rig is None else rig.of(OdometrySettings).wheels
     odometry = options.get("odometry")
     if drive is None or not isinstance(odometry, Mapping):
@@ -262,7 +271,7 @@ def with_wheels_of(rig: Rig | None, options: Mapping[str, Any]) -> Mapping[str, 
 
 
 def with_wheels_in(rig: Rig, options: Mapping[str, Any]) -> Rig:
-    """Return the rig. If it has no wheels, it gets the radius and track of two wheels from the options of the reader."""
+    """Return ``rig``. If it has no wheels, it gets the wheel radius and track in the ``options`` of the reader."""
     odometry = options.get("odometry")
     settings = rig.of(OdometrySettings)
     if settings.wheels is not None or not isinstance(odometry, Mapping):

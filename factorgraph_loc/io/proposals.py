@@ -35,11 +35,12 @@ class Proposal:
 def proposal_of(
     reader: str, path: Path, folder: Path, options: Mapping[str, Any], remarks: Sequence[str], *, with_map: bool = True
 ) -> Proposal:
-    """Return the manifest of the log at ``path`` with the ``options`` of a reader.
+    """Return a proposed manifest of the log at ``path``. A manifest is a TOML file that describes how to read a log.
 
-    It is to be saved in ``folder`` if the log is below ``folder``, else in the folder that contains the log. A rig file
-    and a world file next to the log are named in the manifest. A remark asks for a missing rig or world.
-    ``with_map``: False if ``options`` describe the map, so that no world file is needed.
+    ``reader``, ``options``: the reader of the log and its options. ``folder``: the folder to save the manifest in if
+    the log is below it, else the folder that contains the log is used. A rig file and a world file next to the log are
+    named in the manifest. If one is missing, a remark asks for it. ``with_map``: False if ``options`` describe the map,
+    so that no world file is needed.
     """
     root = folder if path.is_relative_to(folder) else path.parent
     kind = "bag" if reader == "rosbag" else "folder"

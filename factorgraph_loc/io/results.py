@@ -40,7 +40,7 @@ class Estimates:
 
     @classmethod
     def of(cls, table: pl.DataFrame, t0_ns: int) -> "Estimates":
-        """Return the estimates in the rows of ``estimates.parquet``, with times in seconds after ``t0_ns`` [ns]."""
+        """Return the estimates in rows of ``estimates.parquet``, with times [s] since ``t0_ns`` [ns]."""
         numbers = {name: table[name].fill_null(np.nan).to_numpy() for name in NUMBERS}
         covariances = symmetric([numbers[name] for name in COVARIANCES])
         t = (table[STAMP].to_numpy() - t0_ns) / 1e9
@@ -48,7 +48,7 @@ class Estimates:
         return cls(Trajectory(t, poses, covariances), {name: numbers[name] for name in ERRORS})
 
     def rows(self, which: NDArray[np.bool_]) -> "Estimates":
-        """Return the estimates where the mask ``which`` (N,) is True."""
+        """Return those of the N estimates for which the boolean mask ``which`` (N,) is True."""
         return Estimates(self.trajectory.rows(which), {name: values[which] for name, values in self.errors.items()})
 
 
@@ -66,9 +66,10 @@ class ResultFiles:
     folder: Path = Path()
 
     def estimates(self) -> dict[str, Estimates]:
-        """Return causal and final estimates, by the names in :data:`KINDS`.
+        """Return the estimates of a run: "causal" from earlier measurements only, and "final" from the whole log.
 
-        Causal estimates before the first localization are omitted."""
+        Causal estimates before the first localization are omitted.
+        """
         source = self.folder / ESTIMATES
         table = parse_parquet(self.read(ESTIMATES), source, list(COLUMNS))
         with foreign(source, "is no table of estimates"):
@@ -86,7 +87,7 @@ class ResultFiles:
             raise InputError(f"{source}: contains no valid trajectory: {error_text(error)}") from error
 
     def innovations(self) -> dict[str, Array]:
-        """Return an array (K, 3) by sensor: time [s], normalised innovation squared and degrees of freedom."""
+        """Return by sensor an array (K, 3): time [s], normalised innovation squared and degrees of freedom."""
         table = parse_parquet(self.read(INNOVATIONS), self.folder / INNOVATIONS)
         table = table.select("sensor", (pl.col(STAMP) - (self.t0_ns or 0)) / 1e9, "nis", "dof")
         groups = table.group_by("sensor", maintain_order=True)

@@ -169,8 +169,7 @@ def from_ros(messages: Any) -> PosePath:
 def _posed(trajectory: Trajectory | PosePath, t0_ns: int) -> PosePath:
     """Return the poses of a trajectory. ``t0_ns``: the absolute time [ns] of t = 0 of a planar trajectory.
 
-    Raises InputError if there is no pose, or if a pose is not finite.
-    """
+    Raises InputError if there is no pose, or if a pose is not finite."""
     path = trajectory.path("the trajectory", t0_ns) if isinstance(trajectory, Trajectory) else trajectory
     require_poses(path)
     return path
@@ -186,7 +185,7 @@ def _numbers_of_pose(message: Any) -> tuple[float, ...]:
 
 
 def _messages() -> Any:
-    """Return a function that makes a message of ROS 2 or rosbags from its package, type and fields."""
+    """Return a function that makes a ROS message from its package, type and fields, with ROS 2 or else rosbags."""
     try:
         import nav_msgs.msg  # type: ignore[import-not-found] # noqa: F401, PLC0415
     except ImportError:
@@ -202,8 +201,7 @@ def _path(name: str, table: Array, t_ns: Any) -> PosePath:
     """Return the poses in ``table`` (N, 7): positions x, y, z and quaternions x, y, z, w. ``name``: for messages.
 
     ``t_ns`` (N,): the timestamps, None for poses without times. Raises InputError if a number is not finite, or if a
-    quaternion is not a unit quaternion.
-    """
+    quaternion is not a unit quaternion."""
     rows = np.arange(1, len(table) + 1)
     path = PosePath(name, table[:, :3], checked_rotations(name, rows, table), t_ns)
     require_poses(path)

@@ -24,7 +24,7 @@ class Turns:
     angle: Array
 
     def each_window(self) -> Array:
-        """Return the changes of the angle (K,) over K windows of length :data:`WINDOW`, which begin every :data:`STEP`."""
+        """Return the changes of the angle (K,) in K windows of length :data:`WINDOW` that begin every :data:`STEP`."""
         grid = np.arange(self.t[0], self.t[-1], STEP)
         angle = np.interp(grid, self.t, self.angle)
         width = round(WINDOW / STEP)
@@ -44,9 +44,9 @@ class SameTurns:
 
 
 def match(first: Turns, second: Turns) -> SameTurns | None:
-    """Find the clock offset between two tables at which their turns agree best.
+    """Return the clock offset at which two tables have the same turns of the robot, and the ratio of their angles.
 
-    Returns None if no offset makes them agree, such as on a straight drive, or if a table lasts longer than :data:`LONGEST`.
+    Returns None if they agree at no offset, as on a straight drive, or if a table lasts longer than :data:`LONGEST`.
     """
     if not all(0.0 < turns.t[-1] - turns.t[0] < LONGEST for turns in (first, second)):
         return None

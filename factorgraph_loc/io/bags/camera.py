@@ -56,17 +56,17 @@ ENCODINGS: dict[str, tuple[type, int, Callable[[Pixels], Pixels]]] = {
 
 
 class CameraTopic(TopicSettings):
-    """The settings of a topic of images."""
+    """The settings of a ROS topic with the images of a camera."""
 
     info: str | None = None
     """topic of the CameraInfo messages: lens, image size and frame of the camera"""
 
 
 class Images:
-    """Collects the images of a topic.
+    """Collects the images of a ROS topic while its bag is read.
 
-    ``known`` is True if all images are in the cache folder already. The messages are not read then. ``stack`` deletes
-    the temporary folder of newly extracted images when it is closed.
+    ``known``: True if all images are already in the cache folder; then the messages are not read. Newly extracted
+    images are in a temporary folder, which is deleted when ``stack`` is closed.
     """
 
     def __init__(self, bag: Bag, name: str, stamper: Stamper, stack: ExitStack) -> None:
@@ -104,9 +104,9 @@ class Images:
         self._t_ns.append(t_ns)
 
     def stream(self, reading: Reading) -> ImageStream:
-        """Return the stream of images. Newly extracted images are moved to the cache folder.
+        """Return the times and files of the collected images. Newly extracted images are moved to the cache folder.
 
-        ``reading``: has the absolute time of t = 0 in the stream, and a list for warnings.
+        ``reading``: has the absolute time of t = 0 in the stream, and a list that receives warnings.
         """
         if self._written is not None:
             with writing(self._folder), locked(self._folder.parent / LOCK):
@@ -158,14 +158,17 @@ class Info:
         }
 
     def settings(self, mounting: dict[str, float]) -> CameraSettings:
-        """Return the settings of the camera. ``mounting``: its position x, y, z [m] and roll, pitch, yaw [rad] on the robot."""
+        """Return the settings of the camera: image size, lens and mounting.
+
+        ``mounting``: by name, the position x, y, z [m] and roll, pitch, yaw [rad] of the camera in the robot frame.
+        """
         return parse_model(CameraSettings, self._content | mounting, self._source)
 
 
 def netpbm(image: Any, where: str) -> tuple[bytes, str]:
-    """Convert a raw image message to a Netpbm file. Returns the content and the suffix of the file.
+    """Convert an uncompressed ``sensor_msgs/Image`` to a Netpbm file. Returns the content and the suffix of the file.
 
-    ``where`` names the message in errors. Raises InputError if the encoding is not supported or pixels are missing.
+    ``where``: names the message in errors. Raises InputError if the encoding is not supported or pixels are missing.
     """
     if image.encoding not in ENCODINGS:
         raise InputError(f"{where}: encoding is {quoted(image.encoding)}, expected one of {', '.join(ENCODINGS)}")
@@ -192,10 +195,9 @@ def _key(path: Path, topic: str) -> str:
 
 
 def _images_in(folder: Path, count: int) -> list[_Row]:
-    """Return the images in a cache folder, sorted by message number.
+    """Return message number, header timestamp [ns], time of receipt [ns] and file name of each image in a cache folder.
 
-    Returns an empty list if the folder does not have exactly ``count`` images, or has other files.
-    """
+    They are sorted by number. Returns [] if the folder does not have exactly ``count`` images, or has other files."""
     rows = []
     try:
         for file in folder.iterdir():

@@ -66,9 +66,10 @@ def limit_unpacking() -> None:
 
 
 def unpacked(make: Callable[[], Any], data: bytes) -> bytes:
-    """Return ``data`` decompressed. ``make`` creates a decompressor for each part of ``data`` compressed separately.
+    """Return ``data`` decompressed. ``data`` is one compressed block, or several compressed blocks one after the other.
 
-    Raises ValueError if the result is too large, or if ``data`` is truncated.
+    ``make``: returns a new decompressor for a block. Raises ValueError if the result is too large or ``data`` is
+    truncated.
     """
     limit = max(SMALL, min(LARGE, CHUNK_RATIO * len(data)))
     parts: list[bytes] = []
@@ -91,8 +92,7 @@ def unpacked(make: Callable[[], Any], data: bytes) -> bytes:
 class _File:
     """A file that is decompressed while it is read. Reading raises ValueError if its unpacked size exceeds a limit.
 
-    ``file``: the compressed file. ``content``: the decompressing stream on it.
-    """
+    ``file``: the compressed file. ``content``: the decompressing stream on it."""
 
     def __init__(self, content: BinaryIO, file: BinaryIO) -> None:
         self._content = content
@@ -126,7 +126,8 @@ class Topic:
 
 @dataclass(frozen=True)
 class Stamped:
-    """A message. ``row``: its number within the topic, counted from 1. ``received``: its time of receipt [ns]."""
+    """A message of a bag. ``topic``: the name of its topic. ``row``: its number within the topic, counted from 1.
+    ``received``: its time of receipt [ns]. ``message``: the decoded ROS message."""
 
     topic: str
     row: int
@@ -135,7 +136,7 @@ class Stamped:
 
 
 class Bag:
-    """An open bag. ``topics``: its topics by name. ``duration``: time from the first message to the last [s]."""
+    """An open ROS bag. ``topics``: a :class:`Topic` by name. ``duration``: from the first to the last message [s]."""
 
     def __init__(self, path: Path, reader: Any) -> None:
         self.path = path
@@ -233,7 +234,7 @@ def require_metadata(folder: Path) -> None:
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[Bag]:
-    """Open the bag at ``path``. Raises InputError if it cannot be read, or if ``rosbags`` is not installed."""
+    """Open a bag in this block and yield it. Raises InputError if it is unreadable or ``rosbags`` is not installed."""
     if not path.exists():
         raise InputError(f"{path}: does not exist")
     require_metadata(path)

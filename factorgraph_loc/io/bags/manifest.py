@@ -65,10 +65,10 @@ class BagManifest(Proposal):
 
 @dataclass
 class Uses:
-    """The proposed uses of topics.
+    """The proposed uses of the topics of a bag.
 
-    ``options``: options of the reader of bags. ``uses``: the use of each topic by its name. ``remarks``: hints for the
-    user.
+    ``options``: proposed options for reading the bag, such as the topic of each sensor. ``uses``: the name of the
+    sensor, or "reference", by topic. ``remarks``: hints for the user.
     """
 
     options: dict[str, Any] = field(default_factory=dict)
@@ -76,9 +76,9 @@ class Uses:
     remarks: list[str] = field(default_factory=list)
 
     def take(self, sensor: str, topics: Sequence[Topic], **settings: Any) -> None:
-        """Use the first of ``topics`` for a sensor, with ``settings``. A remark lists the other topics.
+        """Propose the first of ``topics`` for a sensor. ``settings``: further options of this sensor.
 
-        Does nothing if ``topics`` is empty.
+        If ``topics`` has several topics, a remark lists the rest. Does nothing if ``topics`` is empty.
         """
         if topics:
             self.options[sensor] = {"topic": topics[0].name, **settings}
@@ -87,7 +87,7 @@ class Uses:
             self.remarks.append(f"{sensor} could also be {', '.join(topic.name for topic in topics[1:])}")
 
     def take_all(self, sensor: str, topics: Mapping[str, Mapping[str, Any]]) -> None:
-        """Use each topic as a separate sensor of the kind ``sensor``. ``topics``: the settings of each topic by its name."""
+        """Propose each topic as a sensor of its own, of the kind ``sensor``. ``topics``: the settings by topic."""
         names = distinct(list(topics)) if len(topics) > 1 else []
         settings = {topic: {"topic": topic, **more} for topic, more in topics.items()}
         if names:
@@ -98,10 +98,10 @@ class Uses:
 
 
 def manifest_of_bag(bag: Path, folder: Path) -> BagManifest:
-    """Propose a manifest, a TOML file that describes how to read a log, for a bag.
+    """Return a proposed manifest of a bag. A manifest is a TOML file that describes how to read a log.
 
-    The manifest is to be saved in ``folder`` if the bag is below ``folder``, else in the folder that contains the bag.
-    Raises InputError if the bag cannot be read.
+    Nothing is written. Paths in the manifest are relative to ``folder`` if the bag is below ``folder``, else to the
+    folder that contains the bag. Raises InputError if the bag cannot be read.
     """
     path, folder = Path(os.path.realpath(bag)), folder.resolve()
     with open_bag(path) as opened:
@@ -123,7 +123,8 @@ def manifest_of_bag(bag: Path, folder: Path) -> BagManifest:
 
 
 def propose(bag: Bag) -> Uses:
-    """Propose a use of each topic. If several topics fit one sensor, the likeliest is used, and a remark lists the others."""
+    """Return a proposed use of each topic. If several fit one sensor, the likeliest is used and a remark lists the
+    rest."""
     out = Uses()
     topics = [topic for topic in bag.topics.values() if topic.count]
     tree = tree_of(bag, out.remarks)
@@ -162,8 +163,7 @@ def propose(bag: Bag) -> Uses:
 def _motion(out: Uses, bag: Bag, topics: Sequence[Topic], tree: Tree) -> None:
     """Add the topic of odometry among ``topics`` to ``out``. ``tree``: the coordinate frames of the bag.
 
-    Messages of type Odometry are preferred, then tf with an odometry frame, Twist, and JointState.
-    """
+    Messages of type Odometry are preferred, then tf with an odometry frame, Twist, and JointState."""
     robot = tree.robot()
     origin = None if robot is None else tree.above(robot, ORIGINS)
     frames = {} if origin is None else {"parent": origin, "child": robot}
@@ -231,8 +231,7 @@ def _reference(out: Uses, bag: Bag, topics: Sequence[Topic], tree: Tree) -> None
     """Add the topics of the reference and of a position sensor to ``out``. ``tree``: the coordinate frames of the bag.
 
     A topic whose name suggests ground truth is the reference. Otherwise, a topic of poses with headings is the
-    reference. A topic of positions without headings is a position sensor.
-    """
+    reference. A topic of positions without headings is a position sensor."""
     poses = [topic for topic in topics if topic.type in {*POSES, POINT} and topic.name not in out.uses]
     named = [topic for topic in poses if TRUTH.search(topic.name)]
     measured = [t for t in poses if t.type != ODOMETRY and not NOT_MEASURED.search(t.name) and t not in named]
@@ -288,7 +287,9 @@ def _camera(out: Uses, topics: Sequence[Topic]) -> None:
 
 
 def _custom(out: Uses, bag: Bag, topics: Sequence[Topic]) -> list[tuple[Topic, list[str]]]:
-    """Return the topics that ``out`` does not use and that have message types from outside of ROS, with field paths."""
+    """Return the topics that ``out`` does not use and that have message types from outside of ROS.
+
+    Each topic has the list of the paths of its message fields."""
     custom = []
     for topic in topics:
         if topic.name in out.uses or topic.type.startswith(
@@ -305,8 +306,7 @@ def _custom(out: Uses, bag: Bag, topics: Sequence[Topic]) -> list[tuple[Topic, l
 def _rfid(out: Uses, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
     """Add the topic of RFID reads to ``out``: the topic with a field for the EPC and with most other fields of a read.
 
-    ``custom``: unused topics with message types that do not come with ROS, and the paths of their fields.
-    """
+    ``custom``: unused topics with message types that do not come with ROS, and the paths of their fields."""
     reads = [(topic, read_fields(paths)) for topic, paths in custom if not range_fields(paths)]
     candidates = [(topic, fields) for topic, fields in reads if "epc" in fields]
     if not candidates:
@@ -336,8 +336,7 @@ def _ranges(out: Uses, custom: Sequence[tuple[Topic, Sequence[str]]]) -> dict[st
     """Return the proposed settings of each topic with ranges to landmarks, by the name of the topic.
 
     Such a topic has a field for a distance, and in the same part of the message a field for the name of a landmark.
-    ``custom``: unused topics with message types that do not come with ROS, and the paths of their fields.
-    """
+    ``custom``: unused topics with message types that do not come with ROS, and the paths of their fields."""
     candidates = {t.name: fields for t, paths in custom if t.name not in out.uses and (fields := range_fields(paths))}
     out.remarks += [
         f"{topic} is read as ranges [m] to landmarks of the map; {fields['landmark']} has the name of the landmark"
@@ -347,10 +346,10 @@ def _ranges(out: Uses, custom: Sequence[tuple[Topic, Sequence[str]]]) -> dict[st
 
 
 def range_fields(paths: Sequence[str]) -> dict[str, str]:
-    """Find the landmark's name and the range in a message type. Return the path of each by field.
+    """Return the paths of two message fields by name: "landmark", the name of a landmark, and "range", its distance.
 
-    ``paths``: the paths of the fields of the message type. Fields are recognised by common names. Returns an empty
-    dictionary if one of the two is missing.
+    ``paths``: the paths of all fields of the message type. The two fields are recognised by common names. Returns an
+    empty dictionary if one of the two is missing.
     """
     distances = {p.rpartition(".")[0]: p for p in paths if _plain(p) in RANGE and p.count(LIST) <= 1}
     named = [p for p in paths if _plain(p) in LANDMARK and p.rpartition(".")[0] in distances]
@@ -361,9 +360,9 @@ def range_fields(paths: Sequence[str]) -> dict[str, str]:
 
 
 def read_fields(paths: Sequence[str]) -> dict[str, str]:
-    """Find the fields of an RFID read in a message type. Return the path of each by field.
+    """Return the paths of the message fields with the values of an RFID read, by "epc", "antenna", "rssi" and so on.
 
-    ``paths``: the paths of the fields of the message type. Fields are recognised by common names.
+    ``paths``: the paths of all fields of the message type. Fields are recognised by common names.
     """
     usable = [path for path in paths if path.count(LIST) <= 1 and not path.startswith("header.")]
     out = {}
@@ -377,9 +376,9 @@ def read_fields(paths: Sequence[str]) -> dict[str, str]:
 
 
 def _units(fields: Mapping[str, str]) -> dict[str, str]:
-    """Return the unit of each field of an RFID read, if the name of its message field implies one, such as rssi_cdbm.
+    """Return the units of the values of an RFID read by name. A message field such as ``rssi_cdbm`` implies a unit.
 
-    ``fields``: the path in the message by field."""
+    ``fields``: the path of the message field of each value, by name. Values without an implied unit are left out."""
     out = {}
     for name, ends in UNITS.items():
         plain = _plain(fields.get(name, ""))

@@ -64,7 +64,7 @@ class WheelSettings(motions.WheelSizes):
 
 
 class JointRows:
-    """Collects the angles or angular velocities of the wheels from a topic of joints (JointState).
+    """Collects the angles or angular velocities of W wheels from a topic with JointState messages.
 
     ``column``: the field of the message to read, ``position`` or ``velocity``.
     """
@@ -88,9 +88,10 @@ class JointRows:
             self.rows.append(item, t_ns, [values[names.index(joint)] for joint in self._wheels.joints])
 
     def pairs(self, warnings: list[Notice]) -> tuple[Integers, Array]:
-        """Return timestamps (N,) [ns] and the values (N, W) of W wheels in order of time.
+        """Return the timestamps (N,) [ns] and the collected values (N, W) of W wheels, in order of time.
 
-        Skipped rows add warnings to ``warnings``. Raises InputError if no message has all joints.
+        If invalid rows are skipped, a warning is appended to ``warnings``. Raises InputError if no message has all
+        joints.
         """
         joints = self._wheels.joints
         if not len(self.rows):
@@ -105,8 +106,9 @@ class JointRows:
 def paired(lefts: TopicRows, rights: TopicRows, warnings: list[Notice]) -> tuple[Integers, Array]:
     """Pair each message of the left wheel (``lefts``) with the message of the right wheel (``rights``) nearest in time.
 
-    Returns the later timestamp of each pair (N,) [ns], and the values (N, 2), left and right. Pairs farther apart than
-    :data:`MAX_OFFSET` are skipped, and a warning is appended to ``warnings``. Raises InputError if no pair remains.
+    Returns the later timestamp of each pair (N,) [ns], and the wheel values (N, 2) of the pair, left and right. Pairs
+    are skipped if their times differ by more than :data:`MAX_OFFSET` times the median period. Then a warning is
+    appended to ``warnings``. Raises InputError if no pair remains.
     """
     l_ns, left = lefts.in_order(("wheel",), warnings)
     r_ns, right = rights.in_order(("wheel",), warnings)
@@ -157,9 +159,10 @@ class YawRates:
         self.add = self._rows.add
 
     def stream(self, reading: Reading) -> YawRateStream:
-        """Return the turn rates about the robot's z axis. Rates about perpendicular axes of the IMU may be NaN.
+        """Return the times [s] and the turn rates about the robot's z axis [rad/s].
 
-        ``reading``: has the absolute time of t = 0 in the stream, and a list for warnings.
+        IMU axes perpendicular to this axis have no influence, and their rates may be NaN. ``reading``: has the absolute
+        time of t = 0 in the stream, and a list that receives warnings.
         """
         turned = self._options.turned()
         if self._options.frame is not None:
@@ -174,10 +177,11 @@ class YawRates:
 
 
 def odometry(listeners: Listeners, options: OdometryTopic, static: StaticFrames) -> Motion:
-    """Register the collectors of an odometry topic at ``listeners``. Returns the function to call after the bag is
-    read: it computes the motion from the collected messages.
+    """Register a collector of messages for the odometry topic, and return a function that computes odometry from them.
 
-    ``static`` has the static transforms of the bag. Raises InputError if the options do not fit the message type.
+    Call the function after the bag is read, with a list that receives warnings. It returns timestamps (N,) [ns] and
+    either velocities (N, 2) or increments (N, 3 or 4). ``listeners``: the collectors of the bag. ``static``: its static
+    transforms. Raises InputError if the options do not fit the message type.
     """
     bag, source = listeners.bag, f"{listeners.bag.path} {options.topic}"
     known = () if options.wheels else sorted({*POSES, *TWISTS, JOINTS, *TF})
@@ -208,12 +212,11 @@ def odometry(listeners: Listeners, options: OdometryTopic, static: StaticFrames)
 
 
 def _velocities(rows: TopicRows, warnings: list[Notice]) -> tuple[Integers, Array]:
-    """Return the timestamps (N,) [ns] and the velocities (N, 2), forward [m/s] and about the vertical [rad/s].
+    """Return the timestamps (N,) [ns] and the velocities (N, 2): forward [m/s] and turn rate [rad/s].
 
-    ``rows``: two velocities, and optionally a quaternion and the variances of x and y. A device that has lost its pose
-    reports null quaternions or variances. Then a warning is appended, and increments (N, 4) are returned instead, see
-    :func:`motions.bridge_losses`.
-    """
+    ``rows``: two velocities, and optionally a quaternion and the variances of x and y. Null quaternions or variances
+    mean that the device had lost its pose. Then a warning is appended to ``warnings``, and the result of
+    :func:`motions.bridge_losses` is returned: timestamps and increments (M, 4)."""
     values = rows.values
     null = np.zeros(len(rows), dtype=bool)
     if values.shape[1] > 2:
@@ -230,7 +233,7 @@ def _velocities(rows: TopicRows, warnings: list[Notice]) -> tuple[Integers, Arra
 
 
 def _of_poses(listeners: Listeners, options: OdometryTopic, static: StaticFrames) -> Motion:
-    """Register a collector of poses or tf at ``listeners``. Return the function that computes the motion from them.
+    """Register a collector of poses or tf at ``listeners``. Return a function that computes odometry from them.
 
     ``static``: the static transforms of the bag."""
     made = poses_of_topic(listeners, options, static)
@@ -245,7 +248,7 @@ def _of_poses(listeners: Listeners, options: OdometryTopic, static: StaticFrames
 
 
 def _of_wheels(listeners: Listeners, options: OdometryTopic, wheels: WheelSettings) -> Motion:
-    """Register collectors of ``wheels`` at ``listeners``. Return the function that computes the motion of the robot."""
+    """Register collectors of ``wheels`` at ``listeners``. Return a function that computes odometry from the wheels."""
     bag = listeners.bag
     if (wheels.base is not None or len(wheels.joints) == 3) and len(wheels.joints) != 4:
         raise InputError(

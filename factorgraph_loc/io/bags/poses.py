@@ -79,9 +79,11 @@ class Start:
             self._found = (t_ns, np.array([numbers_of_pose(stated.pose)], dtype=float), variances)
 
     def pose(self, t0_ns: int, warnings: list[Notice]) -> StartPose:
-        """Return the start pose. Its time [s] counts from ``t0_ns`` [ns]. If the robot is tilted, a warning is appended.
+        """Return the pose as the known start of a log: x, y, heading and their standard deviations.
 
-        Raises InputError if a variance of x, y or heading is not positive."""
+        Its time [s] counts from ``t0_ns`` [ns]. If the robot is tilted, a warning is appended to ``warnings``. Raises
+        InputError if a variance of x, y or heading is not positive.
+        """
         assert self._found is not None
         t_ns, values, variances = self._found
         turns = checked_rotations(self._source, np.ones(1, dtype=np.int64), values)
@@ -93,7 +95,10 @@ class Start:
 
 
 def numbers_of_pose(pose: Any, position: str = "position", orientation: str = "orientation") -> tuple[float, ...]:
-    """Return x, y, z [m] and the quaternion x, y, z, w of the message ``pose``, from the fields with the two names."""
+    """Return x, y, z [m] and the quaternion x, y, z, w of the message ``pose``.
+
+    ``position``, ``orientation``: the names of the fields of the message that have the position and the quaternion.
+    """
     p, q = getattr(pose, position), getattr(pose, orientation)
     return p.x, p.y, p.z, q.x, q.y, q.z, q.w
 
@@ -109,11 +114,12 @@ def checked_rotations(source: str, rows: Integers, table: Array) -> Array:
 
 
 def path_of(rows: TopicRows, warnings: list[Notice], *, has_rotations: bool = True) -> PosePath:
-    """Return the poses of collected ``rows``.
+    """Return the poses in ``rows``, which were collected from a topic.
 
-    A row has x, y, z, then a quaternion unless ``has_rotations`` is False, then optionally the variances of x and y.
-    Null poses, which a device reports while it has lost its pose, are skipped with a warning in ``warnings``. Of rows
-    with equal timestamps, the last is kept. Raises InputError, with the number of the message, at an invalid row.
+    The columns are x, y, z [m], a quaternion x, y, z, w unless ``has_rotations`` is False, and optionally the variances
+    of x and y. Null poses, which a device reports while it has lost its pose, are skipped with a warning in
+    ``warnings``. Of rows with equal timestamps, the last is used. Raises InputError, with the number of the message, at
+    an invalid row.
     """
     source, values = rows.source, rows.values
     if not has_rotations:
@@ -164,9 +170,10 @@ class StaticFrames:
         return None if common is None else np.linalg.inv(theirs[common]) @ ours[common]
 
     def known(self, source: str, frame: str) -> Array:
-        """Return the pose (4, 4) of ``frame`` in the frame of the robot. Raises InputError if no transforms connect the two frames.
+        """Return the pose (4, 4) of ``frame`` in the frame of the robot.
 
-        ``source`` names the topic that needs the pose.
+        Raises InputError if no transforms connect the two frames. ``source``: names the topic that needs the pose, for
+        the error.
         """
         pose = self.pose(frame)
         if pose is None:
@@ -207,10 +214,11 @@ class FrameReference:
             edge.append(item, stamp, numbers_of_pose(transform.transform, "translation", "rotation"))
 
     def path(self, warnings: list[Notice]) -> PosePath:
-        """Return the trajectory at the timestamps of the most frequent transform. Other transforms are interpolated.
+        """Return the poses of the child frame in the parent frame.
 
-        If rows are skipped, warnings are appended to ``warnings``. Raises InputError if the transforms have no time in
-        common, or if none of them changes.
+        The chain between them may have several transforms. The poses are at the timestamps of the most frequent
+        transform; the others are interpolated. If rows are skipped, warnings are appended to ``warnings``. Raises
+        InputError if the transforms have no time in common, or if none of them changes.
         """
         edges = [
             path_of(self._edges[name], warnings) if name in self._edges else self._static.poses[name]
@@ -262,9 +270,10 @@ def static_frames(listeners: Listeners, base: str) -> StaticFrames:
 def poses_of_topic(
     listeners: Listeners, options: PoseTopic, frames: StaticFrames
 ) -> Callable[[list[Notice]], PosePath]:
-    """Register a collector at ``listeners`` for the topic in ``options``: poses, points, or tf with two frames.
+    """Register a collector for a topic of poses, points or tf transforms. Return a function that makes the poses.
 
-    ``frames``: the static transforms of the bag. Returns the function that makes the :class:`PosePath` once the bag is read.
+    Call the function after the bag is read, with a list; it appends warnings to the list. ``listeners``: the collectors
+    of the bag. ``options``: the topic. ``frames``: the static transforms of the bag.
     """
     bag, stamper = listeners.bag, listeners.stamper(options.topic, options.clock)
     kind = bag.topic(options.topic).type
@@ -314,7 +323,7 @@ class Tree:
         return next((name for name in ROBOT if name in self.parents), None)
 
     def above(self, frame: str, names: tuple[str, ...]) -> str | None:
-        """Return the first of ``names`` that is an ancestor of ``frame`` and in which ``frame`` moves, or None."""
+        """Return the first frame of ``names`` that is an ancestor of ``frame`` and moves relative to it, or None."""
         chain = frame_and_ancestors(self.parents, frame)
         first = next((i for i, name in enumerate(chain) if name in self.moving), len(chain))
         return next((name for name in names if name in chain[first + 1 :]), None)

@@ -57,7 +57,8 @@ FRAMES, WITHIN = ":", "."  # /tf:PARENT.CHILD
 def camera_of(info: Info, frames: StaticFrames, notes: list[Notice]) -> CameraSettings:
     """Return the settings of a camera. ``info``: its CameraInfo. ``frames``: the static transforms of the bag.
 
-    If the transforms lack the camera, it is at the robot's origin and points forward. A note is appended to ``notes``.
+    If the transforms lack the frame of the camera, it is mounted at the robot's origin and points forward, and a note
+    for the user is appended to ``notes``.
     """
     pose = frames.pose(info.frame)
     if pose is None:
@@ -73,10 +74,10 @@ def camera_of(info: Info, frames: StaticFrames, notes: list[Notice]) -> CameraSe
 def antennas_of(
     names: Iterable[str], given: Mapping[str, str], frames: StaticFrames, notes: list[Notice]
 ) -> RfidSettings:
-    """Return the settings of the RFID antennas ``names``, mounted where tf_static has their frames.
+    """Return the settings of the RFID antennas ``names``, mounted at the poses of their frames in ``tf_static``.
 
-    ``given``: the frame of each antenna that is not named like its frame. The x axis of a frame is the boresight. An
-    antenna without a frame is at the robot's origin. Notes about the mountings are added to ``notes``.
+    ``given``: the frame by antenna; the frame of any other antenna has the antenna's name. The x axis of a frame is the
+    boresight. An antenna without a frame is at the robot's origin. Notes for the user are appended to ``notes``.
     """
     poses = {name: frames.pose(given.get(name, name)) for name in sorted(names)}
     for verb, known in (("has the", True), ("has no", False)):

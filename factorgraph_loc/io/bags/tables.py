@@ -117,8 +117,7 @@ class RowsOfTopic:
     def _name(self, column: Column, values: Mapping[Any, Any], row: int) -> str:
         """Return the name in ``column`` of a row with these ``values`` by field. Raises InputError if the name is empty.
 
-        ``row``: the number of the message.
-        """
+        ``row``: the number of the message."""
         if text := as_text(values[column.name]):
             return text
         raise bad_field(self._rows.source, column.name, text, column.doc, row=row)
@@ -126,7 +125,7 @@ class RowsOfTopic:
     def rows_of(self, warnings: list[Notice], faults: Sequence[Fault] = ()) -> tuple[TableRows, Integers]:
         """Return the M valid rows, and their indices (M,) among all collected rows.
 
-        ``faults``: faults that the caller has detected, in addition to values that are missing or out of bounds.
+        ``faults``: invalid cells that the caller has detected, in addition to values that are missing or out of bounds.
         Raises InputError at an invalid row, unless ``rules`` skip it. Then a warning is appended to ``warnings``.
         """
         cells = {**self._names, **dict(zip(self._numbered, self._rows.values.T, strict=True))}
@@ -140,7 +139,10 @@ class RowsOfTopic:
         return TableRows.of(read, self._columns, read.nanoseconds()), np.asarray(read.columns[INDEX])
 
     def stream(self, reading: Reading) -> Stream:
-        """Return the rows as a stream, with times since ``reading.t0_ns``. Raises InputError at an invalid row."""
+        """Return the valid rows as the measurements of a sensor, with times [s] since ``reading.t0_ns``.
+
+        ``reading.warnings`` receives warnings. Raises InputError at an invalid row.
+        """
         channel, _ = native_tables()[self._table.name]
         if channel.assemble:
             rows = {self._table.name: self.rows_of(reading.warnings)[0]}
@@ -193,8 +195,7 @@ class Reads(RowsOfTopic):
     def _add_rounds(self, item: Stamped, t_ns: int, reads: slice) -> None:
         """Add the inventory rounds of a message, one for each antenna. ``reads``: the rows of the reads of the message.
 
-        A message without reads is one round of the antenna that the message or the options name.
-        """
+        A message without reads is one round of the antenna that the message or the options name."""
         of_reads = self._names["antenna"][reads]
         antennas = list(dict.fromkeys(of_reads))
         if not antennas and self._options.antenna:
@@ -207,7 +208,10 @@ class Reads(RowsOfTopic):
         self._rounds += [(t_ns, reads, name) for name in antennas]
 
     def stream(self, reading: Reading) -> RfidStream:
-        """Return all reads, grouped into inventory rounds. Raises InputError with the number of an invalid message."""
+        """Return all RFID reads, grouped into inventory rounds, with times [s] since ``reading.t0_ns``.
+
+        ``reading.warnings`` receives warnings. Raises InputError with the number of an invalid message.
+        """
         all_ns = self._rows.t_ns
         table, which = self.rows_of(reading.warnings)
         table = replace(table, names=table.names | {"epc": in_case(table.names["epc"], self._options.epc_case)})
@@ -277,10 +281,11 @@ class Landmarks(RowsOfTopic):
         super().__init__(bag, options.topic, fields, BEARING_RANGE, columns, rules=options)
 
     def rows_of(self, warnings: list[Notice], faults: Sequence[Fault] = ()) -> tuple[TableRows, Integers]:
-        """Return M rows with ranges along the floor [m] and bearings [rad] of landmarks, and indices (M,) of the rows.
+        """Return M rows with ranges along the floor [m] and bearings [rad] of landmarks, and their indices (M,).
 
-        Ranges and bearings that are computed from positions are in the robot frame if tf_static has the frame of the
-        sensor. ``faults``: faults that the caller has detected. Skipped rows add warnings to ``warnings``.
+        The indices count all collected rows. Ranges and bearings computed from positions are in the robot frame if
+        ``tf_static`` has the frame of the sensor. ``faults``: invalid cells that the caller has detected. If rows are
+        skipped, a warning is appended to ``warnings``.
         """
         places = self._rows.values
         more = checks.not_finite("xyz", places) if self._places else ()
@@ -298,7 +303,7 @@ class Landmarks(RowsOfTopic):
 
 
 class Corners(RowsOfTopic):
-    """Collects the corners of detected AprilTags as pixels of named points.
+    """Collects the corners [px] of detected AprilTags. Each corner is an observation of a named point of the map.
 
     The names are ``FAMILY-NUMBER/0`` to ``FAMILY-NUMBER/3``, see :func:`factorgraph_loc.maps.markers.corner_names`.
     """
@@ -322,10 +327,10 @@ class Corners(RowsOfTopic):
 
 
 def rows_of_table(bag: Bag, options: TableTopic, tables: Sequence[Table]) -> RowsOfTopic:
-    """Return a collector for the topic of a table. ``options``: the topic and the fields of its messages.
+    """Return a collector of the measurements of a sensor from a topic. ``options``: the topic and its message fields.
 
-    The collector fills the first of ``tables`` that has default fields for the message type, or else ``tables[0]``.
-    Corners of AprilTags need no fields. Raises InputError if the fields do not fit the table.
+    ``tables``: the possible kinds of rows. The first that has default fields for the message type is used, or else
+    ``tables[0]``. Corners of AprilTags need no fields. Raises InputError if the fields do not fit the table.
     """
     kind = bag.topic(options.topic).type
     if tables[0].name == SIGHTINGS.name and not options.fields and kind == CORNERS:

@@ -228,16 +228,19 @@ class TopicRows:
     def in_order(self, names: Sequence[str], warnings: list[Notice]) -> tuple[Integers, Array]:
         """Return the timestamps (M,) [ns] and the numbers (M, width) of the valid rows, in order of time.
 
-        ``names``: the names of the columns. Rows with a number that is not finite are invalid.
+        ``names``: the names of the columns, for errors. A row with a number that is not finite is invalid. Invalid and
+        late rows raise InputError unless ``rules`` skip or sort them. Then warnings are appended to ``warnings``.
         """
         keep = self.kept(checks.not_finite(names, self.values), warnings)
         return self.t_ns[keep], self.values[keep]
 
     def kept(self, faults: Sequence[Fault], warnings: list[Notice], among: Integers | None = None) -> Integers:
-        """Return the indices of the rows without ``faults``, in order of time. Of equal timestamps the last is kept.
+        """Return the indices of the rows without ``faults``, in order of time. Of equal timestamps, the last row is
+        used.
 
-        ``among``: indices of the rows that the faults describe, by default all. Raises InputError at a fault, or at a
-        row that is out of order, unless ``rules`` skip or sort such rows. Then warnings are appended to ``warnings``.
+        ``faults``: mark invalid cells. ``among``: indices of the rows that they describe; other rows are not returned.
+        None: all rows. Raises InputError at an invalid or late row, unless ``rules`` skip or sort it. Then a warning is
+        appended to ``warnings``.
         """
         rows, t_ns = self.rows, self.t_ns
         keep = np.arange(len(rows)) if among is None else among
@@ -247,7 +250,7 @@ class TopicRows:
 
 
 class Gatherer(Protocol):
-    """Collects the needed data from the messages of one topic. ``add`` checks a message and copies its data."""
+    """Protocol of collectors of data from the messages of a topic. ``add`` checks a message and copies its data."""
 
     def add(self, item: Stamped, t_ns: int) -> None: ...
 
@@ -256,7 +259,10 @@ G = TypeVar("G", bound=Gatherer)
 
 
 class Listeners:
-    """The collectors of the data of each topic of a bag. ``clock``: the timestamps to use for topics without a clock setting."""
+    """The collectors of data from the topics of a bag. :meth:`run` passes the messages to them.
+
+    ``clock``: "header" or "receive", the timestamps to use for topics without a clock setting.
+    """
 
     def __init__(self, bag: Bag, clock: Clock) -> None:
         self.bag, self.clock = bag, clock
@@ -302,8 +308,8 @@ class Listeners:
 class Stamper:
     """Chooses the timestamps [ns] of the messages of one topic.
 
-    If ``clock`` is ``header``, a timestamp is the header's timestamp, or the time of receipt if a message has no header. If it is
-    ``receive``, a timestamp is the time of receipt. For tf, whose headers are nested, use :meth:`choose`.
+    If ``clock`` is "header", a timestamp is that of the header, or the time of receipt if a message has no header. If
+    it is "receive", a timestamp is the time of receipt. Messages of tf have several headers: use :meth:`choose`.
     """
 
     def __init__(self, bag: Bag, topic: Topic, clock: Clock) -> None:
@@ -339,7 +345,7 @@ class Stamper:
 
 
 def report(stampers: list[Stamper], clock: Clock) -> tuple[str, list[Notice]]:
-    """Return a text about the timestamps in use and the delays of receipt, and warnings about clocks that differ.
+    """Return a text about the timestamps in use and the delays of receipt, and a list of warnings if clocks differ.
 
     ``stampers``: the sources of timestamps of all topics. ``clock``: the clock setting of the bag.
     """

@@ -39,7 +39,7 @@ _OR_LOG = ", or one with a log in the native format to overwrite"
 
 
 class Options(FileModel):
-    """The native format has no options."""
+    """The native format has no options. The class exists because every reader takes options."""
 
 
 class RunFile(RowRules):
@@ -110,9 +110,11 @@ def world_of(run: RunFile, source: Path) -> World:
 
 
 def read_tables(folder: Path, warnings: list[Notice], rules: RowRules) -> dict[str, TableRows]:
-    """Return the non-empty tables in a folder by name. Rows that ``rules`` skip are left out.
+    """Return the non-empty tables of sensors in the folder of a log, by the name of the table, such as "odometry".
 
-    Warnings about skipped rows and about tables of unknown sensors are appended to ``warnings``."""
+    Rows that ``rules`` skip are left out. Warnings about these rows and about unknown tables are appended to
+    ``warnings``.
+    """
     tables = {}
     stems = sorted(file.stem for file in folder.iterdir() if file.suffix in SUFFIXES)
     for name in dict.fromkeys((*native_tables(), *stems)):
@@ -141,7 +143,10 @@ def read_tables(folder: Path, warnings: list[Notice], rules: RowRules) -> dict[s
 
 
 def streams_of(tables: Mapping[str, TableRows], reading: Reading) -> dict[str, Stream]:
-    """Return the streams of all sensors that have ``tables``, by the name of the sensor."""
+    """Return the measurements of each sensor by the name of the sensor. ``tables``: the parsed tables of a log by name.
+
+    ``reading``: has the rig, the absolute time of t = 0 [ns], and a list that receives warnings.
+    """
     rows: dict[str, dict[str, TableRows]] = {}
     for name, table in tables.items():
         if (known := native_table(name)) is not None:
@@ -160,12 +165,12 @@ def read_reference(path: Path, t0_ns: int, run: RunFile, warnings: list[Notice])
 def write_native(
     log: Log, folder: str | Path, format: Literal["csv", "parquet"] = "csv", *, overwrite: bool = False
 ) -> None:
-    """Write a log atomically as a folder in the native format.
+    """Write a log atomically as a folder in the native format of this project.
 
     ``folder`` must be new or empty. With ``overwrite`` it may also contain a log in the native format, which is
-    replaced. Timestamps are exact to the nanosecond, numbers to the last digit. Images are copied. Two values are not
-    written: covariances of the reference, and the smaller of the start's standard deviations in x and y. Raises
-    InputError for a log without measurements, and for a log with features of images.
+    replaced. Timestamps are exact to the nanosecond, numbers to the last digit. Images are copied. Limitations:
+    covariances of the reference are not written, and the start has the larger of its standard deviations in x and y.
+    Raises InputError for a log without measurements, and for a log with features of images.
     """
     folder = Path(folder)
     if not log.streams:

@@ -40,7 +40,7 @@ UNCALIBRATED = {"scale_distance": 0.03, "scale_rotation": 0.05, "heading_drift":
 
 
 def default_rig(streams: Iterable[str]) -> Rig:
-    """Return default settings of the robot and its sensors, for a log that describes none. ``streams``: its sensors."""
+    """Return default settings of the robot and its sensors. ``streams``: names of the sensors, such as "odometry"."""
     named = [name for name in streams if kind_of(name) != name and DEFAULT_RIG.section(kind_of(name)) is not None]
     if not named:
         return DEFAULT_RIG
@@ -59,7 +59,10 @@ def read_rig(path: str | Path) -> Rig:
 
 
 def write_rig(rig: Rig, path: str | Path) -> None:
-    """Write a rig to ``NAME.rig.toml``, and its grids (detection models of RFID as tables) to the same folder."""
+    """Write a rig, the settings of a robot and its sensors, to ``path``, which should be named ``NAME.rig.toml``.
+
+    The grids of RFID detection models are written as tables to the same folder.
+    """
     path = Path(path)
     rig.write_beside(path.parent)
     write_toml(path, rig.model_dump(mode="json", exclude_none=True))
@@ -82,8 +85,7 @@ def _lines(
     """Yield the lines of a table of settings and of the tables below it.
 
     ``path``: the keys that lead to the table. ``pattern``: the same keys, with ``*`` for names that the user chooses.
-    ``meanings``: the documentation of each setting by its pattern.
-    """
+    ``meanings``: the documentation of each setting by its pattern."""
     tables = {key: value for key, value in table.items() if isinstance(value, Mapping)}
     own = {key: value for key, value in table.items() if key not in tables}
     if path and (own or not tables):
@@ -130,9 +132,9 @@ class RobotOptions:
 
 
 def new_rig(name: str, robot: RobotOptions) -> tuple[Rig, list[str]]:
-    """Return a rig called ``name`` with the sensors of ``robot``, and remarks on guessed values.
+    """Return a rig called ``name``, the settings of a robot and its sensors, and remarks about the guessed values.
 
-    Raises InputError if a value is out of bounds, or if there is no sensor.
+    ``robot``: its sensors. Raises InputError if a value is out of bounds, or if there is no sensor.
     """
     sections: dict[str, Any] = {}
     remarks: list[str] = []
@@ -187,8 +189,7 @@ def _nested(sections: Mapping[str, Any]) -> dict[str, Any]:
 def _antennas(names: Sequence[str]) -> dict[str, dict[str, float]]:
     """Return the settings of antennas ``names``, evenly spaced around the robot, counter-clockwise from the front.
 
-    Two antennas face to the left and to the right.
-    """
+    Two antennas face to the left and to the right."""
     first = math.pi / 2.0 if len(names) == 2 else 0.0
     directions = [se2.wrap_scalar(first + 2.0 * math.pi * i / len(names)) for i in range(len(names))]
     return {

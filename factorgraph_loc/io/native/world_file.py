@@ -27,9 +27,9 @@ def read_world(path: str | Path) -> World:
 
 
 def parse_world(content: Mapping[str, Any], source: object, folder: Path) -> World:
-    """Return a map from the ``content`` of a world file.
+    """Return the map in ``content``, the keys and values of a world file.
 
-    ``source``: the file to name in errors. ``folder``: the folder of the tables. ``walls`` may name an occupancy map,
+    ``source``: the file, for errors. ``folder``: the folder of the tables. ``walls`` may name an occupancy map,
     ``markers`` a file of apriltag_ros, and a layer such as ``tags`` a table. The corners of ``markers`` become points.
     Raises InputError if a value is invalid.
     """

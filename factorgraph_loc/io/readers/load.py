@@ -36,7 +36,7 @@ T = TypeVar("T")
 
 
 def reader(name: str) -> Any:
-    """Return the module of the reader ``name``. Raises InputError with the most similar name if there is no such reader."""
+    """Return the module that reads the format ``name``. Raises InputError with the most similar name if none does."""
     if name not in READERS:
         raise InputError(f"there is no reader {quoted(name)}{nearest(name, list(READERS))}")
     return READERS[name]
@@ -47,8 +47,7 @@ class _Source:
     """Where a log comes from.
 
     ``reader``: name of the reader. ``path``: its input. ``name``: name of the log, None if the reader names it.
-    ``manifest``: the manifest that describes the log, if there is one. ``file``: the file of the manifest.
-    """
+    ``manifest``: the manifest that describes the log, if there is one. ``file``: the file of the manifest."""
 
     reader: str
     path: Path | None
@@ -115,7 +114,10 @@ def load(
 def load_all(
     logs: LogLike | Sequence[LogLike], rig: RigLike | None = None, world: WorldLike | None = None
 ) -> list[Log]:
-    """Return the logs that ``logs`` refer to. ``rig``, ``world``: replacements for those of the logs, if not None."""
+    """Return a list of all logs that ``logs`` refers to: files, names of shipped data sets, or ``Log`` objects.
+
+    ``rig``, ``world``: if not None, they replace those of the logs.
+    """
     several = [logs] if isinstance(logs, (Log, str, Path)) else logs
     return [loaded for log in several for loaded in load(log, rig=rig, world=world)]
 
@@ -129,7 +131,8 @@ def read_log(
     rig: RigLike | None = None,
     world: WorldLike | None = None,
 ) -> Log:
-    """Return the only log that :func:`load` returns for the same arguments. Raises InputError if there are several."""
+    """Return the log that ``log`` refers to. The arguments are those of :func:`load`. Raises InputError if there are
+    several."""
     logs = load(log, data_root=data_root, reader=reader, options=options, rig=rig, world=world)
     if len(logs) > 1:
         raise InputError(f"{log} refers to {len(logs)} logs, expected one: {listed(loaded.name for loaded in logs)}")
@@ -206,11 +209,10 @@ def _from_manifest(file: Path, data_root: str | Path | None) -> _Source:
 
 
 def _read(source: _Source, rig: Rig | None, world: World | None, options: Mapping[str, Any], naming: list[str]) -> Log:
-    """Read and check one log from ``source``.
+    """Read one log from ``source``, check it, and return it.
 
     ``rig``, ``world``: if given, they replace the rig and the world of the log. ``options``: one value per option.
-    ``naming``: the options that are appended to the name of the log to make it unique.
-    """
+    ``naming``: the options that are appended to the name of the log to make it unique."""
     chosen, manifest = reader(source.reader), source.manifest
     options = with_wheels_of(rig, options)
     log: Log = chosen.read(source.path, parse_model(chosen.Options, options, f"options of reader {source.reader}"))

@@ -40,8 +40,8 @@ RATE = replace(IMU["w"], may_lack=True)  # turn rate about one of three axes, wh
 
 
 class NamesFile(ColumnMapping):
-    """Settings of a table that translates names. The fields in ``columns`` are ``file_name``, a name in the table of a
-    sensor, and ``name``, the name in the map."""
+    """Settings of a table that translates names used by a sensor to names in the map. ``columns`` has two fields:
+    ``file_name``, a name in the table of the sensor, and ``name``, the name in the map."""
 
 
 class NamedFile(TimedMapping):
@@ -94,9 +94,9 @@ add_fields(Options, {name: (_type_of(name), None) for name in OTHERS}, after="ca
 
 
 def read(path: Path | None, options: Options) -> Log:
-    """Read the log in the folder ``path``. Its t = 0 is the first timestamp of the sensors.
+    """Read the log in the folder ``path``, which has tables of other programs. ``options``: the columns of the tables.
 
-    Raises InputError with file, row and column of an invalid value.
+    Its t = 0 is the first timestamp of the sensors. Raises InputError with file, row and column of an invalid value.
     """
     if path is None:
         raise InputError("mapped: path is missing in the manifest: name the folder of the log's files")
@@ -149,10 +149,9 @@ def read(path: Path | None, options: Options) -> Log:
 
 
 def _table(folder: TableFolder, tables: Sequence[Table], mapping: TimedMapping) -> TableRows:
-    """Read the file in ``folder`` that ``mapping`` names, as a table of the native format.
+    """Read the file that ``mapping`` names in ``folder``. Return its rows with the fields of a table in ``tables``.
 
-    The table is the first of ``tables`` for which ``mapping`` has all required fields.
-    """
+    The first of ``tables`` is used for which ``mapping`` has all required fields."""
     shapes = tuple(_fields(table, mapping) for table in tables)
     columns = {column.name: column for table in tables for column in table.columns}
     if isinstance(mapping, ImuFile):

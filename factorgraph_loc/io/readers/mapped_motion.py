@@ -66,9 +66,11 @@ class ReferenceFile(PosesFile):
 
 
 def read_odometry(folder: TableFolder, options: OdometryFile) -> tuple[Integers, Array]:
-    """Return the timestamps (N,) [ns] of the odometry, and its velocities (N, 2) or increments (N, 3).
+    """Return the timestamps (N,) [ns] of the odometry, and its velocities (N, 2) or increments (N, 3 or 4).
 
-    Raises InputError with the file and the row of an invalid value.
+    A velocity is forward [m/s] and turn rate [rad/s]. An increment is x, y [m] and heading [rad] since the previous
+    timestamp, and optionally the part [s] of that time with lost poses. Raises InputError with file and row of an
+    invalid value.
     """
     path, warnings = folder.file(options.file), folder.warnings
     if options.is_in_format():
@@ -131,11 +133,10 @@ def read_reference(folder: TableFolder, options: ReferenceFile, t0_ns: int) -> T
 
 
 def _with_poses(mapped: Cells, options: PosesFile, warnings: list[Notice]) -> tuple[Cells, Integers]:
-    """Return the rows of ``mapped`` without null poses, and the timestamps [ns] of the null poses.
+    """Return the rows of ``mapped`` without null poses, and the timestamps (M,) [ns] of the null poses.
 
     A device reports null poses while it has lost its pose. Raises InputError if a quaternion is not a unit quaternion,
-    unless the mapping skips such rows. Null poses and skipped rows add warnings to ``warnings``.
-    """
+    unless ``options`` skip such rows. If any rows are skipped, a warning is appended to ``warnings``."""
     if "qw" not in mapped.columns:
         return mapped, np.zeros(0, dtype=np.int64)
     null = are_null(np.column_stack([mapped.numbers(name, COLUMNS[name]) for name in QUATERNION]))
@@ -148,9 +149,9 @@ def _with_poses(mapped: Cells, options: PosesFile, warnings: list[Notice]) -> tu
 
 
 def _in_format(folder: TableFolder, options: PosesFile) -> tuple[Integers, Array, Integers]:
-    """Read a file in TUM, KITTI or EuRoC format. Return its timestamps (N,) [ns] and planar poses (N, 3).
+    """Return timestamps (N,) [ns] and planar poses (N, 3) of a TUM, KITTI or EuRoC file, and timestamps of null poses.
 
-    The third value has the timestamps of null poses, which mean that the device had lost its pose."""
+    A null pose means that the device had lost its pose."""
     path = folder.file(options.file)
     if options.columns or options.units:
         raise InputError(f"{path}: format {options.format} defines columns and units: remove columns and units")

@@ -87,7 +87,7 @@ class Channels(FileModel):
 
 @cache
 def presets() -> dict[str, dict[str, dict[str, str]]]:
-    """Return the settings ``columns`` and ``units`` for the files of known RFID tools, by the name of the tool."""
+    """Return the settings ``columns`` and ``units`` for the RFID logs of known programs, by the name of the program."""
     content: dict[str, dict[str, dict[str, str]]] = read_toml(shipped.readers()["mapped"])
     return content
 
@@ -139,10 +139,7 @@ def read_all_reads(folder: TableFolder, options: RfidFile) -> TableRows:
 
 
 def joined(path: Path, tables: Sequence[TableRows]) -> TableRows:
-    """Join tables of RFID reads to one table that is sorted by time.
-
-    ``path``: the name of the joined table in errors.
-    """
+    """Join tables of RFID reads to one table, sorted by time. ``path``: the name of the joined table in errors."""
     reads = _concatenated(path, tables)
     return reads.rows_at(np.argsort(reads.t_ns, kind="stable"))
 
@@ -158,10 +155,10 @@ def _concatenated(path: Path, tables: Sequence[TableRows]) -> TableRows:
 
 
 def read_reads(folder: TableFolder, path: Path, options: RfidFile) -> TableRows:
-    """Return the reads of one file as the table ``rfid`` of the native format, sorted by time.
+    """Return the RFID reads of one file, sorted by time.
 
-    A row that summarizes several reads gives two reads, the first and the last one. The measured values belong to the
-    first one. Raises InputError with file, row and column of an invalid value.
+    A row that summarizes several reads gives two: the first, with the measured values, and the last.
+    ``folder.warnings`` receives warnings. Raises InputError with file, row and column of an invalid value.
     """
     wide = "*" in options.columns.get("rssi", "")
     if not wide and ("antenna" in options.columns) == (options.antenna is not None):
@@ -214,8 +211,7 @@ def _channel(channels: tuple[float, ...] | Channels | None) -> Column:
 def _epcs(mapped: Cells) -> tuple[list[str], list[Fault]]:
     """Return the EPC of each row as hexadecimal digits, and the faults of empty and invalid EPCs.
 
-    The quotes around EPCs such as ``b'30F4'``, which some versions of sllurp write, are removed.
-    """
+    The quotes around EPCs such as ``b'30F4'``, which some versions of sllurp write, are removed."""
     texts, faults = [""] * len(mapped.rows), []
     if "epc" in mapped.columns:
         texts = mapped.texts("epc")
@@ -242,9 +238,9 @@ def _from_base64(text: str) -> str:
 
 
 def _in_sequence(mapped: Cells, options: RfidFile, warnings: list[Notice]) -> Cells:
-    """Return the rows of ``mapped``. Raises InputError at a row in which the last read is before the first read.
+    """Return the rows of ``mapped``. Raises InputError at a row whose last read is before its first read.
 
-    If the options skip invalid rows, they are left out instead, and a warning is appended to ``warnings``."""
+    If the options skip invalid rows, such rows are left out instead, and a warning is appended to ``warnings``."""
     if "last" not in mapped.columns:
         return mapped
     wrong = mapped.stamps("last", options.clock_offset) < mapped.stamps("t", options.clock_offset)
@@ -252,9 +248,9 @@ def _in_sequence(mapped: Cells, options: RfidFile, warnings: list[Notice]) -> Ce
 
 
 def _frequencies(mapped: Cells, channels: tuple[float, ...] | Channels | None) -> Array:
-    """Return the carrier frequencies (N,) [Hz] of the reads from the numbers of their channels, which start at 1.
+    """Return the carrier frequencies (N,) [Hz] of N reads. NaN if the channel of a read is unknown.
 
-    ``channels``: the frequencies of the channels [MHz].
+    ``mapped``: the reads with channel numbers, which start at 1. ``channels``: the frequencies of the channels [MHz].
     """
     number = mapped.numbers("channel", _channel(channels))
     if isinstance(channels, Channels):
@@ -264,10 +260,10 @@ def _frequencies(mapped: Cells, channels: tuple[float, ...] | Channels | None) -
 
 
 def _with_last(table: TableRows, mapped: Cells, options: RfidFile, warnings: list[Notice]) -> TableRows:
-    """Return the table with a second read, without a signal strength, for each row that summarizes several reads.
+    """Return ``table`` with an additional read at the end of each row that summarizes several reads.
 
-    The second read is the last of the row. A warning about the reads in between, which have no timestamps, is appended.
-    """
+    The additional read has the timestamp of the last read and no measured values. Reads between the first and the last
+    have no timestamps; a warning about them is appended to ``warnings``."""
     if "last" not in mapped.columns:
         if "count" in mapped.columns and (many := int(np.count_nonzero(mapped.numbers("count", COUNT) > 1.0))):
             sentence = "{source}: {rows} rows summarize several reads with one timestamp: each counts as one read"

@@ -111,8 +111,7 @@ def shipped(run: int) -> Path:
 def _rows(source: str, table: Array, columns: str) -> TableRows:
     """Return the rows of ``table`` (N, K), whose first column is the time [s]. Raises InputError if a number is not finite.
 
-    ``columns``: the names of the K columns, separated by spaces.
-    """
+    ``columns``: the names of the K columns, separated by spaces."""
     rows = np.arange(1, len(table) + 1, dtype=np.int64)
     names = columns.split()
     checks.require_finite(source, rows, names, table)
@@ -130,8 +129,11 @@ def beacons(source: str, table: Array) -> World:
 
 
 def increments(driven: TableRows, t0_ns: int, warnings: list[Notice]) -> IncrementStream:
-    """Return the rows ``driven`` of odometry as increments. If they begin after ``t0_ns``, a row without motion is
-    added at ``t0_ns``. If rows have equal timestamps, they are composed and a warning is appended to ``warnings``."""
+    """Return the odometry increments of a log, from the rows ``driven`` with the columns dx [m] and dtheta [rad].
+
+    If the rows begin after ``t0_ns`` [ns], a row without motion is added at ``t0_ns``. If rows have equal timestamps,
+    their motions are composed, and a warning is appended to ``warnings``.
+    """
     moves = np.column_stack((driven.numbers["dx"], np.zeros(len(driven.rows)), driven.numbers["dtheta"]))
     t_ns, moves = checks.increments_in_order(driven.path, driven.rows, driven.t_ns, moves, warnings)
     if t_ns[0] > t0_ns:
@@ -141,8 +143,10 @@ def increments(driven: TableRows, t0_ns: int, warnings: list[Notice]) -> Increme
 
 
 def ranges(observed: TableRows, t0_ns: int, warnings: list[Notice]) -> Stream:
-    """Return the rows ``observed`` of ranges as a stream with times after ``t0_ns`` [ns]. Rows are sorted by time, with
-    a warning in ``warnings`` if their order changes."""
+    """Return ranges to landmarks with times [s] since ``t0_ns`` [ns], sorted by time.
+
+    ``observed``: rows with a landmark and a range [m]. If the order changes, a warning is appended to ``warnings``.
+    """
     distance = observed.numbers["range"]
     require(distance > 0.0, observed.path, observed.rows, "range", distance, "more than 0")
     if moved := int(np.count_nonzero(observed.t_ns < np.maximum.accumulate(observed.t_ns))):

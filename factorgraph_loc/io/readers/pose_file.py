@@ -86,8 +86,7 @@ def _read(
     rules: RowRules | None = None,
 ) -> Cells:
     """Return the cells of a file without header that begins with these ``columns``. ``unit``: the unit of the
-    timestamps. ``rules``: whether invalid rows are skipped and late rows sorted. None: both are errors.
-    """
+    timestamps. ``rules``: whether invalid rows are skipped and late rows sorted. None: both are errors."""
     numbered = {name: str(i) for i, name in enumerate(columns, start=1)}
     units: dict[str, str | float] = {} if unit is None else {"t": unit}
     form: dict[str, Any] = {"columns": numbered, "units": units, "separator": separator, "header": False}

@@ -89,7 +89,9 @@ def read(path: Path | None, _options: Options) -> Log:
 
 
 def _parsed(path: Path) -> dict[str, TableRows]:
-    """Return the rows of each kind in :data:`ROWS`. Raises InputError at a row of another kind, or with too few or many values."""
+    """Return the rows of a PyFactorGraph file by their first word, such as "EDGE_RANGE".
+
+    Raises InputError at a row whose first word is not in :data:`ROWS`, or with too few or too many values."""
     lines: dict[str, list[tuple[int, list[str]]]] = {kind: [] for kind in ROWS}
     for row, line in enumerate(read_text(path).splitlines(), start=1):
         kind, *values = line.split() or [""]
@@ -132,8 +134,7 @@ def _table(rows: TableRows, columns: str) -> Array:
 def _numbered(poses: TableRows) -> dict[str, int]:
     """Return the index of each pose by its name.
 
-    Raises InputError at a repeated name, and at a pose of a second robot, whose name begins with another letter.
-    """
+    Raises InputError at a repeated name, and at a pose of a second robot, whose name begins with another letter."""
     numbers: dict[str, int] = {}
     robot = poses.names["POSE"][0][:1]
     for i, name in enumerate(poses.names["POSE"]):
@@ -160,10 +161,10 @@ def _require_chain(moves: TableRows, poses: Sequence[str]) -> None:
 
 
 def _ranges(ranged: TableRows, numbers: Mapping[str, int], marks: Mapping[str, Landmark], t_ns: Integers) -> TableRows:
-    """Return the ranges as rows of a table, in order of their poses.
+    """Return a table of ranges to landmarks, in order of the poses that they were measured at.
 
-    ``numbers``: the index of each pose by name. ``marks``: the landmarks by name. ``t_ns``: the timestamp of each pose.
-    Raises InputError at a range from an unknown pose or to an unknown landmark.
+    ``ranged``: the rows of ranges. ``numbers``: the index of each pose by name. ``marks``: the landmarks by name.
+    ``t_ns``: the timestamp of each pose. Raises InputError at a range from an unknown pose or to an unknown landmark.
     """
     names = zip(ranged.rows.tolist(), ranged.names["POSE"], ranged.names["LANDMARK"], strict=True)
     for row, pose, mark in names:
@@ -179,10 +180,9 @@ def _ranges(ranged: TableRows, numbers: Mapping[str, int], marks: Mapping[str, L
 
 
 def _rig(moves: TableRows, ranged: TableRows, durations: Array, warnings: list[Notice]) -> Rig:
-    """Return a rig with the median noise of the motions ``moves`` and of the ranges ``ranged``.
+    """Return a rig with the noise of odometry and ranges: the median of the noise in the rows ``moves`` and ``ranged``.
 
-    ``durations``: the durations of the motions [s]. Noise that differs between rows adds a warning to ``warnings``.
-    """
+    ``durations``: of the motions [s]. If the noise differs between rows, a warning is appended to ``warnings``."""
     per_time = {}
     for name, column in {"along": "cxx", "lateral": "cyy", "heading": "ctt"}.items():
         variance = _positive(moves, column)
