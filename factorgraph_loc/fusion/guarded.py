@@ -64,8 +64,8 @@ class Guard:
             estimator.process(measurement)
 
     def computing(self, what: str, t: float | None = None) -> Self:
-        """Return a context for a request to the estimator: an exception inside becomes a RunFailedError. ``what``: the
-        requested result, such as "the estimate", for the message. ``t`` [s]: the requested time, or None."""
+        """Return a context for a request to the estimator: an exception inside becomes a RunFailedError. Its message
+        names ``what``, the requested result, such as "the estimate", and ``t`` [s], its time, unless None."""
         self._computing, self._of = what, t
         return self
 
@@ -109,8 +109,8 @@ def sound(estimate: PoseEstimate) -> PoseEstimate:
 
 
 def sound_belief(belief: Belief) -> Belief:
-    """Return a belief in which the covariance of each mode is symmetric and positive definite. Raises ValueError if a
-    mode cannot be repaired, or if a particle is not finite."""
+    """Return a belief with symmetric and positive definite covariances of all modes. Raises ValueError if a covariance
+    cannot be repaired, or if a pose or particle is not finite."""
     for values in (belief.particles, belief.weights):
         if values is not None and not np.all(np.isfinite(values)):
             raise ValueError("the particles are not finite")

@@ -146,9 +146,9 @@ class Tracking(Search):
     def keep(
         self, sensor: Sensor, observation: Observation, odometry: ChainState, evidence: Callable[[], float]
     ) -> None:
-        """Store an observation that has corrected the estimated pose, for a global search that may become necessary.
-        ``odometry``: the integrated odometry at its time. ``evidence()``: returns the log-probability of the
-        observation if the estimated pose is right."""
+        """Store an observation that has corrected the estimated pose. A later global search may use it. ``odometry``:
+        the integrated odometry at its time. ``evidence()``: returns the log-probability of the observation if the
+        estimated pose is right."""
         current = observation.at_its_time() if self._weighs else None
         if current is None or not self._is_due(sensor, odometry.t):
             return

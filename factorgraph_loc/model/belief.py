@@ -24,8 +24,9 @@ Status = Literal["unlocalized", "ambiguous", "localized"]
 class PosePrior:
     """Gaussian prior of the start pose.
 
-    ``pose`` (3,) is (x, y, heading) at time ``t`` [s] with ``covariance`` (3, 3), in the world frame. ``has_heading``
-    is False if the heading is unknown. The heading of ``pose`` is then 0, with the variance of a uniform distribution.
+    ``pose`` (3,): x, y [m], heading [rad] at time ``t`` [s], with ``covariance`` (3, 3), in the world frame.
+    ``has_heading``: False if the heading is unknown. The heading of ``pose`` is then 0, with the variance of a uniform
+    distribution.
     """
 
     t: float
@@ -35,7 +36,8 @@ class PosePrior:
 
     @staticmethod
     def at_position(t: float, position: Array, covariance: Array) -> PosePrior:
-        """Return the prior of a ``position`` (2,) [m] with ``covariance`` (2, 2) [m^2] and unknown heading, at time ``t`` [s]."""
+        """Return the prior of a ``position`` (2,) [m] at time ``t`` [s], with ``covariance`` (2, 2) [m^2] and unknown
+        heading."""
         whole = np.diag((0.0, 0.0, math.pi**2 / 3.0))
         whole[:2, :2] = covariance
         return PosePrior(t, np.append(position, 0.0), whole, has_heading=False)
@@ -68,7 +70,7 @@ class Mode:
 
 @dataclass(frozen=True)
 class Belief:
-    """The belief of an estimator about the current pose.
+    """The probability distribution of the current pose.
 
     ``modes``: weighted Gaussians. ``particles`` (N, 3): poses in the world frame, with ``weights`` (N,). Both are None
     if the estimator uses no particles.
@@ -80,7 +82,7 @@ class Belief:
 
 
 def gaussian_belief(estimate: PoseEstimate) -> Belief:
-    """Return the belief with a Gaussian ``estimate`` as its only mode. It has no modes if the estimate is not finite."""
+    """Return a belief with the Gaussian ``estimate`` as its only mode, or with no mode if it is not finite."""
     if not np.isfinite(estimate.pose).all():
         return Belief(())
     return Belief((Mode(1.0, np.array(estimate.pose), np.array(estimate.covariance)),))
@@ -88,7 +90,7 @@ def gaussian_belief(estimate: PoseEstimate) -> Belief:
 
 @dataclass(frozen=True)
 class LearntPoint:
-    """Estimated ``position`` (2,) [m] of a landmark with ``covariance`` (2, 2) of (x, y), in the world frame."""
+    """The ``position`` (2,) [m] of a landmark, with ``covariance`` (2, 2) [m^2] of (x, y), in the world frame."""
 
     position: Array
     covariance: Array
@@ -96,12 +98,11 @@ class LearntPoint:
 
 @dataclass(frozen=True)
 class Learnt:
-    """Estimates of an estimator other than poses.
+    """The estimated sensor constants and landmarks of a run.
 
-    ``values``: constants of sensors by name, each as (value, standard deviation) in SI units. Constants of odometry
-    have plain names (``scale_distance``), other constants have the sensor as a prefix (``bearing_range.x``).
-    ``landmarks``: estimated landmarks by name.
-    ``points``: estimated points in space that the map lacks, or None.
+    ``values``: {name: (value, standard deviation)} of sensor constants in SI units. Constants of odometry have plain
+    names (``scale_distance``), other constants have the sensor as a prefix (``bearing_range.x``). ``landmarks``:
+    estimated landmarks by name. ``points``: estimated points in space that the map lacks, or None.
     """
 
     values: Mapping[str, tuple[float, float]] = field(default_factory=dict)

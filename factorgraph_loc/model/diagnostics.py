@@ -14,7 +14,7 @@ Addition = tuple[dict[str, Any], str, Any]
 
 @dataclass(frozen=True)
 class Event(Notice):
-    """A notice about an event at time ``t`` [s]."""
+    """A message about an event during a run. ``t`` [s]: the time of the event."""
 
     t: float
 
@@ -23,11 +23,11 @@ class Event(Notice):
 class Diagnostics:
     """Counts and consistency statistics of a run.
 
-    ``residuals``: by sensor and quantity (``bearing_range.range`` in m), measurement minus prediction before the
-    update. ``nis``: by sensor, rows of (t [s], normalised innovation squared, degrees of freedom).
-    ``ignored``, ``rejected``: counts of detections by reason. ``late``: counts of late measurements by sensor.
-    ``events``: events of the estimator, for example a rebuilt graph.
-    ``doubted``: by kind of doubt (``moved_tags``), {name of a map element: probability that the map is wrong about it}.
+    ``residuals``: by sensor and quantity (``bearing_range.range`` in m), a list of measurement minus prediction.
+    ``nis``: by sensor, a list of (t [s], normalised innovation squared, degrees of freedom) per update. ``ignored``,
+    ``rejected``: counts of detections by reason. ``late``: counts of late measurements by sensor. ``events``: events of
+    the estimator, for example a rebuilt graph. ``doubted``: by kind of error of the map (``moved_tags``), {name of a
+    map element: probability of the error}. ``added``: the list of :meth:`record`, None while nothing is recorded.
     """
 
     nis: dict[str, list[tuple[float, float, int]]] = field(default_factory=dict)
@@ -56,8 +56,8 @@ class Diagnostics:
         return "\n".join([*lines, *(f"{kind}: {', '.join(names)}" for kind, names in self.doubted.items())])
 
     def ignore(self, reason: str, count: int = 1) -> None:
-        """Add ``count`` to the number of detections that are ignored for a ``reason``. A negative ``count`` reverses an
-        earlier call, if these detections are used after all."""
+        """Add ``count`` to the number of detections that are ignored for a ``reason``. A negative ``count`` cancels an
+        earlier call, if the detections are used after all."""
         self.ignored[reason] = self.ignored.get(reason, 0) + count
         if not self.ignored[reason]:
             del self.ignored[reason]
@@ -94,7 +94,7 @@ class Diagnostics:
             self.events.append(event)
 
     def keep_last(self, rows: int) -> None:
-        """Keep only the last ``rows`` innovations of each sensor, residuals of each quantity, and events."""
+        """Delete all but the last ``rows`` innovations of each sensor, residuals of each quantity, and events."""
         for innovations in self.nis.values():
             del innovations[:-rows]
         for residuals in self.residuals.values():
@@ -102,7 +102,7 @@ class Diagnostics:
         del self.events[:-rows]
 
     def copy(self) -> Diagnostics:
-        """Return a deep copy, without recorded additions."""
+        """Return a deep copy that is not recording."""
         return Diagnostics(
             {name: list(rows) for name, rows in self.nis.items()},
             {name: list(values) for name, values in self.residuals.items()},
@@ -114,17 +114,17 @@ class Diagnostics:
         )
 
     def record(self) -> list[Addition]:
-        """Start to record what is added to the diagnostics. Return the list of additions, for :meth:`take_back`.
+        """Start to record additions to these diagnostics. Returns a list that will contain them, for :meth:`take_back`.
 
-        Recording ends when ``added`` is set to None. Late measurements and events are not recorded.
+        Recording ends when ``added`` is set to None. Limitation: late measurements and events are not recorded.
         """
         self.added = []
         return self.added
 
     def take_back(self, added: Sequence[Addition]) -> None:
-        """Remove recorded additions, before the same measurements are processed again.
+        """Remove earlier additions from these diagnostics, before the same measurements are processed again.
 
-        ``added``: the list from :meth:`record`. Rows that :meth:`keep_last` has removed are skipped.
+        ``added``: the additions, a list from :meth:`record`. Entries that :meth:`keep_last` has removed are skipped.
         """
         for totals, name, rows in reversed(added):
             if isinstance(rows, int):

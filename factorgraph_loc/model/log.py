@@ -24,7 +24,8 @@ RIG_NOTES = "robot"  # key of the metadata: notes about a rig that the reader de
 
 @dataclass(frozen=True)
 class StartPose:
-    """A known start: ``pose`` (3,) in the world at time ``t`` [s], and standard deviations ``sigmas`` (3,) of x, y, heading."""
+    """A known start of the robot. ``pose`` (3,): x, y [m], heading [rad] in the world frame at time ``t`` [s].
+    ``sigmas`` (3,): their standard deviations."""
 
     t: float
     pose: Array
@@ -36,9 +37,9 @@ class Log:
     """A recorded or simulated run of a robot.
 
     ``rig``: the robot and its sensors. ``world``: the map. ``streams``: the measurements, by the name of the sensor.
-    ``reference``: the reference trajectory. ``start``: the known start. ``t0_ns``: absolute time of t = 0 [ns].
-    ``warnings``: problems that the reader corrected or skipped. ``metadata``: licence, origin and other texts by key,
-    see :data:`NOT_READ` and :data:`RIG_NOTES`.
+    ``reference``: the reference trajectory, or None. ``start``: the known start, or None. ``t0_ns``: absolute time of t
+    = 0 [ns]. ``warnings``: problems that the reader corrected or skipped. ``metadata``: licence, origin and other texts
+    by key, see :data:`NOT_READ` and :data:`RIG_NOTES`.
     """
 
     name: str
@@ -72,16 +73,17 @@ class Log:
         return float(min(a for a, _ in stamps)), float(max(b for _, b in stamps))
 
     def measurements(self, sensors: Sequence[str]) -> Iterator[Measurement]:
-        """Return the measurements of ``sensors`` in order of arrival. Time offsets in the rig are added to timestamps.
+        """Return the measurements of ``sensors`` (names) in order of arrival. Time offsets in the rig are added to
+        timestamps.
 
         A measurement arrives at its timestamp. A late measurement, which is older than an earlier row of its stream,
-        arrives with that row. At equal times, the ranks of the streams determine the order.
+        arrives with that row. At equal times, the attribute ``rank`` of the streams determines the order.
         """
 
         return (m for _, _, _, m in heapq.merge(*self._arrivals(self._in_order(sensors))))
 
     def steps(self, sensors: Sequence[str]) -> Iterator[Measurement]:
-        """Return the measurements as :meth:`measurements` does, but with rows of one stream joined, for speed.
+        """Return the measurements like :meth:`measurements`, but with consecutive rows of one stream joined, for speed.
 
         Rows of a stream with ``joins`` become one :class:`~factorgraph_loc.model.measurement.Rows` up to the next
         measurement of another stream. Late rows are not joined.
@@ -112,13 +114,14 @@ class Log:
         return replace(self, rig=self.rig.alone(sensor), streams=streams)
 
     def _in_order(self, sensors: Sequence[str]) -> list[str]:
-        """Return the names of the streams of ``sensors``. Measurements with equal times are processed in this order."""
+        """Return the names of the streams of ``sensors``, in the order of processing measurements with equal times."""
         return sorted((s for s in self.streams if s in sensors), key=lambda s: (self.streams[s].rank, s))
 
     def _arrivals(
         self, order: Sequence[str], without: int | None = None
     ) -> list[Iterator[tuple[float, int, int, Measurement]]]:
-        """Return the measurements of each stream in ``order``, except the one with index ``without``, as sortable tuples.
+        """Return an iterator per stream in ``order`` over its measurements, as sortable tuples. ``without``: the index
+        of a stream in ``order`` that is left out.
 
         A tuple has the time of arrival [s], the index of the stream, the index of the row, and the measurement.
         """
@@ -147,7 +150,7 @@ def cut(log: Log, start: float, end: float) -> Log:
     """Return the part of a log, and of its reference, with timestamps from ``start`` to before ``end`` [s].
 
     Timestamps do not change. Time offsets of sensors are not considered. The part has no known start pose. Its first
-    odometry increment is still the motion since the previous row of the whole log. Raises InputError if it is empty.
+    odometry increment is the motion since the previous row of the whole log. Raises InputError if it is empty.
     """
 
     def inside(t: Array) -> NDArray[np.bool_]:
@@ -168,7 +171,7 @@ def cut(log: Log, start: float, end: float) -> Log:
 
 
 def join(first: Log, second: Log, *, gap: float = 0.1) -> Log:
-    """Join two logs to the log of a kidnapped robot: ``second`` follows ``gap`` seconds after the end of ``first``.
+    """Return a log of a robot that was carried: ``second`` begins ``gap`` seconds after the end of ``first``.
 
     The timestamps of ``second`` are shifted, its poses are not changed, and its first odometry increment becomes zero.
     Start, metadata and absolute time are from ``first``. Raises InputError if rig, map or kind of odometry differ, or
@@ -194,7 +197,7 @@ def join(first: Log, second: Log, *, gap: float = 0.1) -> Log:
 
 
 def _joined_references(first: Trajectory | None, second: Trajectory | None, shift: float) -> Trajectory | None:
-    """Join two references, the second shifted in time by ``shift`` [s]. Returns None if both are None.
+    """Return two reference trajectories joined to one, the second shifted by ``shift`` [s]. None if both are None.
 
     Covariances and headings are kept only if both references have them.
     """

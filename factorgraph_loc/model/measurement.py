@@ -25,12 +25,10 @@ FLOOR, TURN, EXTEROCEPTIVE = 0, 1, 2  # ranks of streams: motion on the floor, r
 class Measurement(Protocol):
     """A measurement of a sensor.
 
-    ``t``: time of the event [s], with the time offset of the sensor added.
-    ``sensor``: the name of its stream in a log and in the option ``--sensors``.
-    ``modality``: the kind of sensor; an estimator declares the modalities that it uses.
-    ``source``: the name of the sensor if there are several of a kind, by default the modality.
-    ``count``: number of detections in the measurement.
-    ``is_motion``: True if it measures the robot's motion.
+    ``t``: time of the event [s], with the time offset of the sensor added. ``sensor``: the name of its stream in a log
+    and in the option ``--sensors``. ``modality``: the kind of sensor. An estimator uses or ignores all measurements of
+    a kind. ``source``: the name of the sensor if there are several of a kind, by default the modality. ``count``:
+    number of detections in the measurement. ``is_motion``: True if it measures the robot's motion.
     """
 
     @property
@@ -48,12 +46,13 @@ class Measurement(Protocol):
 
 
 def channel_of(m: Measurement) -> str:
-    """Return the name of the stream of a measurement in a log. If there are several sensors of a kind, it is the sensor's name."""
+    """Return the name of a measurement's stream in a log. If there are several sensors of its kind, this is the
+    sensor's name."""
     return m.source if kind_of(m.source) == m.sensor else m.sensor
 
 
 def named(m: Measurement) -> str:
-    """Return the name of the measurement ``m`` for an error message, such as ``BearingRange at 1.500 s``."""
+    """Return a name of the measurement ``m`` for error messages, such as ``BearingRange at 1.500 s``."""
     return f"{type(m).__name__} at {m.t:.3f} s"
 
 
@@ -113,11 +112,10 @@ class Rows:
 class Stream:
     """All measurements of one sensor in a log, stored as columns of N rows. Subclasses add the columns of a sensor.
 
-    Rows are in order of arrival. A late row has an older timestamp than the row before.
-    ``t`` (N,): times from the start of the log by the clock of the sensor [s].
-    ``source``: the name of the sensor if there are several of its kind, else "".
-    ``rank``: orders measurements of several streams with equal timestamps.
-    ``joins``: True if consecutive rows may be joined to one :class:`~factorgraph_loc.model.measurement.Rows`.
+    Rows are in order of arrival. A late row has an older timestamp than the row before. ``t`` (N,): times from the
+    start of the log by the clock of the sensor [s]. ``source``: the name of the sensor if there are several of its
+    kind, else "". ``rank``: of measurements with equal timestamps, those of a stream with a lower rank are processed
+    first. ``joins``: True if consecutive rows may be joined to one :class:`~factorgraph_loc.model.measurement.Rows`.
     ``kind``: the class of a measurement, which is constructed from a timestamp and the columns.
     """
 
@@ -128,11 +126,12 @@ class Stream:
     source: str = field(default="", kw_only=True)
 
     def measurements(self, offset: float) -> Iterator[Measurement]:
-        """Return one measurement per row. ``offset`` [s] is added to the timestamps."""
+        """Yield one measurement per row. ``offset`` [s] is added to the timestamps."""
         return map(self._made, (self.t + offset).tolist(), *(np.asarray(column).tolist() for column in self._columns()))
 
     def rows(self, offset: float) -> Rows:
-        """Return all rows of a stream with ``joins`` as one measurement. ``offset`` [s] is added to the timestamps."""
+        """Return all rows joined to one measurement. The stream must have ``joins``. ``offset`` [s] is added to the
+        timestamps."""
         return Rows(self.kind, self.t + offset, tuple(np.array(column, dtype=float) for column in self._columns()))
 
     @property
@@ -145,18 +144,19 @@ class Stream:
         return (column for name, column in columns_of(self).items() if name != "t")
 
     def without_first_motion(self) -> Self:
-        """Return the stream with zero motion in its first row, for a log in which the robot was carried before that
-        row. Streams that do not measure motion are returned unchanged."""
+        """Return the stream with zero motion in its first row. Use it if the robot was carried before that row. Streams
+        that do not measure motion are returned unchanged."""
         return self
 
     def scans(self) -> Iterator[tuple[int, int]]:
-        """Yield the first row, and the row after the last, of each sequence of rows with equal timestamps."""
+        """Yield for each sequence of rows with equal timestamps the index of its first row and of the row after it."""
         return pairwise([*np.flatnonzero(np.diff(self.t, prepend=np.nan) != 0.0).tolist(), len(self.t)])
 
 
 @dataclass(frozen=True)
 class ScanStream(Stream):
-    """A stream in which successive rows with equal timestamps form one measurement. Each field of it has K values."""
+    """A stream with one measurement per group of successive rows with equal timestamps. A measurement's fields are
+    arrays with one value per row."""
 
     def measurements(self, offset: float) -> Iterator[Measurement]:
         """Yield one measurement per timestamp. ``offset`` [s] is added to the timestamps."""
@@ -171,8 +171,8 @@ S = TypeVar("S", bound=Stream)
 
 
 def of_sensor(stream: Stream, name: str) -> Stream:
-    """Return the stream with the sensor's ``name`` as its ``source``. If the name has no dot, the stream is returned
-    unchanged, because the sensor is then the only one of its kind."""
+    """Return the stream with the sensor's ``name`` as its ``source``. A stream is returned unchanged if the name has no
+    dot, as for the only sensor of its kind."""
     return stream if kind_of(name) == name else replace(stream, source=name)
 
 

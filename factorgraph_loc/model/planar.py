@@ -47,7 +47,8 @@ Axes = Annotated[str, AfterValidator(_axes)]
 
 
 class Mounting(FileModel):
-    """Orientation of a sensor on the robot: rotations about x, then y, then z."""
+    """Orientation of a sensor on the robot: rotations [rad] ``roll`` about x, then ``pitch`` about y, then ``yaw``
+    about z."""
 
     roll: Angle = 0.0
     """rotation about the x axis"""
@@ -69,7 +70,8 @@ class Mounting(FileModel):
 
 
 class Turned(FileModel):
-    """The orientation of recorded poses or measurements: their axes, and the mounting of their frame on the robot."""
+    """The orientation of recorded poses or measurements. ``axes``: their axes. ``mounting``: the orientation of their
+    frame on the robot."""
 
     axes: Axes | None = None
     """recorded axes that point forward, left and up: body (x, y, z), optical (z, -x, -y), or such a list"""
@@ -93,18 +95,19 @@ AS_IT_IS = Turned()
 
 
 def not_unit(quaternions: Array) -> Fault:
-    """Return a :class:`Fault` with a mask of the ``quaternions`` (N, 4) that are not of length 1, for an error message."""
+    """Return a :class:`Fault`, the data of an error message. Its mask (N,) marks the ``quaternions`` (N, 4) that are
+    not of length 1."""
     with np.errstate(over="ignore"):
         length = np.sqrt(np.sum(quaternions**2, axis=1))
     return Fault("length of the quaternion", length, ~(np.abs(length - 1.0) <= UNIT), "1, a unit quaternion")
 
 
 def are_null(quaternions: Array, variances: Array | None = None) -> NDArray[np.bool_]:
-    """Return a mask (N,) of null poses, which programs publish while they have lost track.
+    """Return a mask (N,) of null poses, which some programs publish while they do not know the pose.
 
-    A pose with a zero quaternion (N, 4) is null. So is a pose with a variance of x or y (N, 2) [m^2] of :data:`HUGE` or
-    more, if it is far above that of the last valid pose. If more than half of the quaternions are zero, they mark no
-    null poses, so that the reader refuses the file.
+    ``quaternions`` (N, 4): a pose with a zero quaternion is null, unless more than half of all quaternions are zero.
+    ``variances`` (N, 2) [m^2] of x and y: a variance of a null pose is at least :data:`HUGE`, and far above that of the
+    last valid pose.
     """
     null = np.asarray(~quaternions.any(axis=1))
     if 2 * np.count_nonzero(null) > len(null):
@@ -130,7 +133,7 @@ def _rise(variances: Array, null: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def null_poses(source: object, row: int, count: int) -> Notice:
-    """Return the warning about ``count`` null poses, the first in ``row`` of ``source``."""
+    """Return a warning about ``count`` null poses in the file ``source``. ``row``: the row of the first of them."""
     sentence = (
         "{source}:{row}: the pose is null, the first of {poses} null poses: they are skipped, and the motion is unknown "
         "until the next valid pose"
@@ -141,7 +144,8 @@ def null_poses(source: object, row: int, count: int) -> Notice:
 def rotations_of(source: str | Path, rows: Integers, quaternions: Array) -> Array:
     """Return the rotation matrices (N, 3, 3) of ``quaternions`` (N, 4), in the order x, y, z, w.
 
-    ``source``, ``rows`` (N,): the file and the row numbers for errors. Raises InputError if a quaternion is not of length 1.
+    ``source``: the file, ``rows`` (N,): the row numbers, for errors. Raises InputError if a length of a quaternion is
+    not 1.
     """
     require_none(source, rows, [not_unit(quaternions)])
     x, y, z, w = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
@@ -156,11 +160,12 @@ def rotations_of(source: str | Path, rows: Integers, quaternions: Array) -> Arra
 def on_floor(
     source: object, positions: Array, rotations: Array | None, warnings: list[Notice], turned: Turned = AS_IT_IS
 ) -> Array:
-    """Return planar poses (N, 3) of ``positions`` (N, 3) and ``rotations`` (N, 3, 3): x, y and the direction of the x axis.
+    """Return planar poses (N, 3) of ``positions`` (N, 3) [m] and ``rotations`` (N, 3, 3). The heading is that of the x
+    axis.
 
-    ``turned``: the axes of the recorded poses, and how their frame is mounted on the robot. Without ``rotations``,
-    headings are 0. Adds a warning about the file ``source`` to ``warnings`` if heights or tilts are too large. Raises
-    InputError if heights differ by more than :data:`MOST` and no axes are set, because y and z may be swapped.
+    ``turned``: the axes of the recorded poses, and how their frame is mounted on the robot. If ``rotations`` is None,
+    headings are 0. A warning about the file ``source`` is appended to ``warnings`` if heights or tilts are too large.
+    Raises InputError if heights differ by more than :data:`MOST` and no axes are set, because y and z may be swapped.
     """
     places = positions @ turned.standing().T
     poses = np.column_stack((places[:, :2], np.zeros(len(places))))
@@ -187,10 +192,10 @@ def on_floor(
 
 
 def about_z(source: object, rows: Integers, rates: Array, turned: Array) -> Array:
-    """Return the turn rates (N,) about the robot's z axis, from the ``rates`` (N, 3) of a sensor about its own axes.
+    """Return turn rates (N,) [rad/s] about the robot's z axis. ``rates`` (N, 3): about the axes of a sensor.
 
     ``turned`` (3, 3): the rotation from the sensor frame to the robot frame. ``source``, ``rows`` (N,): the file and
-    the row numbers for errors. Raises InputError if a rate is not finite, unless its axis is perpendicular to z.
+    the row numbers, for errors. Raises InputError if a rate is not finite, unless its axis is perpendicular to z.
     """
     needed = np.flatnonzero(np.abs(turned[2]) > NEGLIGIBLE)
     for i in needed.tolist():

@@ -29,7 +29,7 @@ class Exchange:
     def from_numpy(cls, table: Array) -> Self:
         """Return a trajectory from an array with the columns of :meth:`to_numpy`, one row per pose.
 
-        Raises InputError if the shape is wrong, or if the times do not increase.
+        Raises InputError if the number of columns is wrong, or if the times do not increase.
         """
         rows = np.asarray(table, dtype=float)
         columns = cls._columns()
@@ -78,7 +78,7 @@ class Exchange:
 
 
 def numbers(table: pl.DataFrame, names: Iterable[str]) -> Array:
-    """Return the K columns ``names`` of a table as an array (N, K). Raises InputError if a value is not a number."""
+    """Return the K columns ``names`` of a table as an array (N, K). Raises InputError if an entry is not a number."""
     import polars as pl  # noqa: PLC0415
 
     columns = []
@@ -105,9 +105,10 @@ def require_times(name: str, t: Array | Integers) -> None:
 class PosePath(Exchange):
     """A sequence of three-dimensional poses in a world frame.
 
-    ``name``: the name in errors. ``positions`` (N, 3) [m]. ``rotations`` (N, 3, 3). ``t_ns`` (N,): absolute times [ns], strictly
-    increasing, or None if only the order of the poses is known. ``has_rotations``: False if the rotations are meaningless.
-    ``warnings``: problems that a reader corrected. ``lost_ns``: times [ns] of null poses, which are not in the sequence.
+    ``name``: the name in errors. ``positions`` (N, 3) [m]. ``rotations`` (N, 3, 3): from the body frame to the world
+    frame. ``t_ns`` (N,): absolute times [ns], strictly increasing, or None if only the order of the poses is known.
+    ``has_rotations``: False if the rotations are meaningless. ``warnings``: problems that a reader corrected.
+    ``lost_ns``: times [ns] of null poses, which are not in the sequence.
     """
 
     name: str
@@ -138,7 +139,7 @@ class PosePath(Exchange):
         return np.array([t / 10**9 for t in self.stamps().tolist()])
 
     def rows(self, which: Integers) -> PosePath:
-        """Return the poses with the indices ``which``."""
+        """Return a path with only the poses with the indices ``which``."""
         t_ns = None if self.t_ns is None else self.t_ns[which]
         return replace(self, positions=self.positions[which], rotations=self.rotations[which], t_ns=t_ns)
 
@@ -156,7 +157,8 @@ class PosePath(Exchange):
         return replace(self, positions=positions, rotations=rotations, t_ns=t_ns)
 
     def on_floor(self, warnings: list[Notice], turned: Turned = AS_IT_IS) -> Array:
-        """Return planar poses (N, 3), see :func:`~factorgraph_loc.model.planar.on_floor`."""
+        """Return planar poses (N, 3): x, y [m], heading [rad]. ``warnings``: a list, extended by warnings about heights
+        or tilts. ``turned``: the axes of the recorded poses, see :func:`~factorgraph_loc.model.planar.on_floor`."""
         return on_floor(self.name, self.positions, self.rotations if self.has_rotations else None, warnings, turned)
 
     def headings(self) -> Array:
@@ -164,7 +166,7 @@ class PosePath(Exchange):
         return np.arctan2(self.rotations[:, 1, 0], self.rotations[:, 0, 0])
 
     def seen_from_above(self) -> PosePath:
-        """Return the poses at height 0, with rotations about the vertical axis only."""
+        """Return the path projected on the floor: height 0, and rotations about the vertical axis only."""
         return replace(self, positions=self.positions * (1.0, 1.0, 0.0), rotations=upright(self.headings()))
 
     def quaternions(self) -> Array:
@@ -202,7 +204,7 @@ def require_poses(path: PosePath) -> None:
 
 
 def upright(headings: Array) -> Array:
-    """Return the rotations (N, 3, 3) about the vertical axis by ``headings`` (N,) [rad]."""
+    """Return the rotation matrices (N, 3, 3) about the vertical axis by ``headings`` (N,) [rad]."""
     out = np.zeros((len(headings), 3, 3))
     out[:, 0, 0] = out[:, 1, 1] = np.cos(headings)
     out[:, 1, 0] = np.sin(headings)

@@ -16,12 +16,12 @@ from factors.se2 import Array
 
 @dataclass(frozen=True, eq=False)
 class Reliability:
-    """A comparison of the numbers of detections that one sensor made and that its model predicted, in G groups.
+    """A comparison of a sensor's number of detections with the number that its model predicts, in G groups.
 
-    ``what``: the plural name of the detections. ``groups`` (G,): names of the groups of measurements.
-    ``observed``, ``predicted`` (G,): counts of detections.
-    ``sigma`` (G,): standard deviation of ``observed`` if the model is correct, for correlated successive measurements.
-    ``overdispersion``: number of correlated measurements that have the information of one independent measurement.
+    ``what``: the plural name of the detections. ``groups`` (G,): names of the groups of measurements. ``observed``,
+    ``predicted`` (G,): counts of detections. ``sigma`` (G,): standard deviation of ``observed`` if the model is
+    correct, for correlated successive measurements. ``overdispersion``: number of correlated measurements that have the
+    information of one independent measurement.
     """
 
     what: str
@@ -36,14 +36,12 @@ class Reliability:
 class Timings:
     """Computing times and memory of a run.
 
-    ``update_t`` (M,): timestamps with an exteroceptive measurement [s from the start of the log].
-    ``update_ms`` (M,): computing time of each of these updates and of the estimate that follows [ms].
-    ``causal_seconds``: computing time of all measurements and causal estimates [s].
-    ``real_time_factor``: the duration of the log divided by ``causal_seconds``.
-    ``final_seconds``: computing time of the final trajectory [s].
-    ``peak_memory_mb``: peak resident memory of the process so far [10^6 bytes].
-    ``images``: number of images. ``frontend_seconds``: time to detect their features before the run, or to load them
-    from the cache [s].
+    ``update_t`` (M,): timestamps of measurements except odometry [s from the start of the log]. ``update_ms`` (M,):
+    computing time of each of these updates and of the estimate that follows [ms]. ``causal_seconds``: computing time of
+    all measurements and of the estimates during the run [s]. ``real_time_factor``: the duration of the log divided by
+    ``causal_seconds``. ``final_seconds``: computing time of the final trajectory [s]. ``peak_memory_mb``: peak resident
+    memory of the process so far [10^6 bytes]. ``images``: number of images. ``frontend_seconds``: time to detect their
+    features before the run, or to load them from the cache [s].
     """
 
     update_t: Array
@@ -61,10 +59,10 @@ class RunResult:
     """The result of one estimator on one log.
 
     ``log``: the name of the log. ``config``: the effective configuration, enough to repeat the run. ``t`` (N,) [s],
-    ``poses`` (N, 3), ``covariances`` (N, 3, 3), ``status`` (N): the causal estimates, in the world frame. ``final``:
-    the trajectory that is estimated from the whole log. ``learnt``: estimates other than poses. ``reliability``: by
-    sensor, a comparison of observed and predicted detections.
-    ``doubts_model`` (N): True where measurements contradicted the model of their sensor.
+    ``poses`` (N, 3), ``covariances`` (N, 3, 3), ``status`` (N): the causal estimates, in the world frame. An estimate
+    is causal if it uses only earlier measurements. ``final``: the trajectory that is estimated from the whole log.
+    ``learnt``: estimated sensor constants and landmarks. ``reliability``: by sensor, a comparison of observed and
+    predicted detections. ``doubts_model`` (N): True where measurements contradicted the model of their sensor.
     """
 
     log: str
@@ -87,7 +85,7 @@ class RunResult:
 
     @property
     def max_gap(self) -> float:
-        """The longest gap [s] between two estimates that scoring interpolates."""
+        """The longest gap [s] between two estimates that a comparison with the reference interpolates."""
         return float(self.config.get("max_gap", MAX_GAP))
 
     def first_localized(self) -> int | None:

@@ -26,7 +26,8 @@ class Rig(FileModel):
     robot lacks it.
 
     If the robot has several sensors of a kind, the attribute is a dict of settings by name. The full name of such a
-    sensor is ``bearing_range.front``, for example. In ``sensors``, a kind stands for all sensors of that kind.
+    sensor is ``bearing_range.front``, for example. ``sensors``: used by default. The name of a kind stands for all of
+    them.
     """
 
     name: str = "rig"
@@ -45,7 +46,8 @@ class Rig(FileModel):
         return self
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
-        """Return a copy with updated values. A name with a dot, ``bearing_range.front``, updates one of several sensors."""
+        """Return a copy with the values in ``update`` (by section). A name with a dot, ``bearing_range.front``, updates
+        one of several sensors."""
         changed = dict(update or {})
         for name in [name for name in changed if kind_of(name) != name]:
             kind, _, own = name.partition(".")
@@ -53,15 +55,15 @@ class Rig(FileModel):
         return super().model_copy(update=changed, deep=deep)
 
     def section(self, name: str) -> Any:
-        """Return the settings in a section, or of one of several sensors (``bearing_range.front``). None if the rig lacks it."""
+        """Return the settings in a section, or of one of several sensors (``bearing_range.front``). None if missing."""
         return by_name(kind_of(name), getattr(self, kind_of(name), None)).get(name)
 
     def names(self, section: str) -> tuple[str, ...]:
-        """Return the names of all sensors with settings in a section."""
+        """Return the names of all sensors in a section: one, several such as ``bearing_range.front``, or none."""
         return tuple(by_name(section, getattr(self, section, None)))
 
     def expanded(self, sensors: Iterable[str]) -> tuple[str, ...]:
-        """Return the names ``sensors``. The name of a kind is replaced by the names of all sensors of that kind in the rig."""
+        """Return ``sensors`` with each name of a kind replaced by the names of all sensors of that kind in the rig."""
         return tuple(dict.fromkeys(each for name in sensors for each in self.names(name) or (name,)))
 
     def alone(self, sensor: str) -> Self:
@@ -76,7 +78,7 @@ class Rig(FileModel):
     def find(self, kind: type[S], section: str | None = None) -> S | None:
         """Return the settings of class ``kind``, or None if the rig lacks them.
 
-        ``section`` is needed if several sections have this class.
+        ``section``: the name of the section, needed if several sections have this class.
         """
         settings: S | None = self.section(section or _SECTIONS[kind])
         return settings
@@ -89,8 +91,8 @@ class Rig(FileModel):
         return settings
 
     def estimated(self, section: str) -> Estimated:
-        """Return the calibration constants of the sensor with this section that are estimated, none if the rig lacks
-        it."""
+        """Return the calibration constants of a sensor that are estimated. The result is empty if the rig lacks the
+        sensor. ``section``: the sensor's section in the rig."""
         settings = self.section(section)
         return settings.estimated() if isinstance(settings, SensorSettings) else NOTHING
 
@@ -101,7 +103,8 @@ class Rig(FileModel):
         return float(settings.time_offset) if isinstance(settings, SensorSettings) else 0.0
 
     def placed(self, folder: Path) -> Self:
-        """Return a copy for a rig file in ``folder``: names of files, such as tables of RFID models, become relative to it."""
+        """Return a copy for a rig file in ``folder``: paths, such as those of tables of RFID models, are relative to
+        it."""
         return self.model_copy(update={name: settings.placed(folder) for name, settings in self._of_sensors().items()})
 
     def write_beside(self, folder: Path) -> None:
@@ -120,7 +123,7 @@ _CLOCKS = sections_of_channels()
 
 
 def _type_of(name: str, section: Section) -> tuple[Any, Any]:
-    """Return the type of a section's settings, and their default."""
+    """Return the type of a section's settings, and their default. ``name``: the name of the section."""
     kind = _KINDS[name]
     if section.always:
         return kind, kind()

@@ -33,13 +33,12 @@ TOLERANCE = 1e-6  # a tick may follow the last measurement by this fraction of a
 class RunConfig:
     """The configuration of a run on a log.
 
-    ``estimator``: the name of the estimator. ``settings``: overrides of its default settings.
-    ``sensors``: names of the sensors to use, None for those in the rig; ``rssi`` and ``phase`` are optional parts of
-    ``rfid``. ``prior``: the start, see :func:`~factorgraph_loc.experiments.preparation.resolve_prior`.
-    ``seed``: the seed of the estimator's random generator.
-    ``max_gap``: the longest gap [s] between two estimates that scoring interpolates.
-    ``tick_gap``: the longest gap [s] between measurements that estimates are recorded in.
-    ``align``: unless it is "none", there are also scores after this alignment with the reference.
+    ``estimator``: the name of the estimator. ``settings``: overrides of its default settings. ``sensors``: names of the
+    sensors to use, None for the default of the rig. ``rssi`` and ``phase`` are optional parts of ``rfid``. ``prior``:
+    the start, see :func:`~factorgraph_loc.experiments.preparation.resolve_prior`. ``seed``: the seed of the estimator's
+    random generator. ``max_gap``: the longest gap [s] between two estimates that scoring interpolates. ``tick_gap``: no
+    estimates are recorded in gaps between measurements longer than this [s]. ``align``: unless it is "none", there are
+    also scores after this alignment with the reference.
     """
 
     estimator: str
@@ -59,7 +58,7 @@ def check_max_gap(max_gap: float) -> None:
 
 
 def check_tick_gap(gap: float) -> None:
-    """Raise InputError if ``gap`` [s], the setting ``tick_gap``, is out of bounds."""
+    """Raise InputError if ``gap`` [s], the value of the setting ``tick_gap``, is out of bounds."""
     if not SHORTEST <= gap <= LONGEST:
         raise InputError(f"tick_gap is {gap:g}, expected {SHORTEST:g} to {LONGEST:g} s")
 
@@ -90,7 +89,7 @@ def parse_position(prior: str) -> list[float]:
 def parse_seeds(text: str, source: object = "--seeds") -> range:
     """Return the seeds in a text: ``0:10`` gives the seeds 0 to 9, ``3`` the seed 3.
 
-    Raises InputError if the text is invalid. ``source``: the option to name in the error.
+    Raises InputError if the text is invalid. ``source``: the name of the option in the error message.
     """
     first, colon, end = text.partition(":")
     try:
@@ -107,8 +106,8 @@ def parse_seeds(text: str, source: object = "--seeds") -> range:
 class Ticks:
     """The ticks of a run: the times at which estimates are recorded. They are computed while measurements arrive.
 
-    ``start``: time of the first tick [s]. A tick follows all measurements up to its time. Ticks have a constant
-    interval, but there are none in a time of more than ``gap`` [s] without measurements.
+    ``start``: time of the first tick [s]. A tick at time t follows all measurements up to t. Ticks have a constant
+    interval. There are none in a gap of more than ``gap`` [s] without measurements.
     """
 
     def __init__(self, start: float, gap: float = TICK_GAP) -> None:
@@ -120,7 +119,7 @@ class Ticks:
 
     @property
     def seconds(self) -> float:
-        """The time from the start to the newest measurement without the skipped gaps [s]."""
+        """The time [s] from the start to the newest measurement, without gaps longer than ``gap``."""
         return self._newest - self._start - sum(end - begin for begin, end in self.skipped)
 
     @property
@@ -129,7 +128,7 @@ class Ticks:
         return self._start + self._next / RATE
 
     def advance(self, t: float) -> Iterable[float]:
-        """Advance to the next measurement, at time ``t`` [s]. Returns the ticks before it that were not returned yet."""
+        """Return the new ticks [s] before the next measurement, at time ``t`` [s]."""
         if self._newest <= t <= self._start + self._next / RATE and t <= self._newest + self.gap:
             self._newest = t
             return ()  # the most frequent case, which must be fast

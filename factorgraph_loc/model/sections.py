@@ -17,10 +17,10 @@ from factorgraph_loc.text import plain
 class Section:
     """A section of a rig.
 
-    ``kind``: the class of its settings, a :class:`~factorgraph_loc.files.models.FileModel`.
-    ``always``: True if a rig without the section gets the default settings.
-    ``several``: True if a rig may have several such sensors, each in a table ``[section.NAME]``. The sensor's stream,
-    its only table and the modality of its measurements must then have the name of the section.
+    ``kind``: the class of its settings, a :class:`~factorgraph_loc.files.models.FileModel`. ``always``: True if a rig
+    without the section gets the default settings. ``several``: True if a rig may have several such sensors, each in a
+    table ``[section.NAME]``. The sensor's stream, its only table and the modality of its measurements must then have
+    the name of the section.
     """
 
     kind: Place
@@ -32,13 +32,11 @@ class Section:
 class Layer:
     """A layer of a map: elements of one class by name, such as RFID tags.
 
-    ``kind``: the class of an element, a :class:`~factorgraph_loc.files.models.FileModel`.
-    ``table``: the description of a table with many elements.
-    ``read``: a function ``(content, source, folder) -> elements``. It converts the value in a world file, such as the
-    name of a table in ``folder``.
-    ``write``: a function ``(elements, path of the world file without suffixes) -> content``. It writes a table and
-    returns the name of the table, or None if the elements belong into the world file.
-    ``suffix``: the suffix of the tables that ``write`` writes.
+    ``kind``: the class of an element, a :class:`~factorgraph_loc.files.models.FileModel`. ``table``: the description of
+    a table with many elements. ``read``: a function ``(content, source, folder) -> elements``. It converts the value in
+    a world file, such as the name of a table in ``folder``. ``write``: a function ``(elements, path of the world file
+    without suffixes) -> content``. It writes a table and returns the name of the table. It returns None if the elements
+    are written in the world file itself. ``suffix``: the suffix of the tables that ``write`` writes.
     """
 
     kind: Place
@@ -50,7 +48,8 @@ class Layer:
 
 @cache
 def registered() -> Mapping[str, Any]:
-    """Return the registered sensors by name, each a :class:`~factorgraph_loc.sensors.registry.SensorType`, built-in ones first.
+    """Return the types of sensors by name, each a :class:`~factorgraph_loc.sensors.registry.SensorType`, built-in ones
+    first.
 
     Raises InputError if a sensor cannot be loaded, or if two sensors have the same channel, section or layer.
     """
@@ -66,14 +65,15 @@ def registered() -> Mapping[str, Any]:
 
 
 def sections() -> dict[str, Section]:
-    """Return the sections of a rig by name, in the order of its file. Sections of sensors without measurements are last."""
+    """Return the sections of a rig by name, in the order of a rig file. Those of sensors without measurements are
+    last."""
     by_name = {name: section for sensor in registered().values() for name, section in sensor.settings.items()}
     used = set(sections_of_channels().values())
     return {name: by_name[name] for name in sorted(by_name, key=lambda name: name not in used)}
 
 
 def sections_of_channels() -> dict[str, str]:
-    """Return {channel: section of the rig}. A channel is the name of a stream of measurements."""
+    """Return {channel: section of the rig}. A channel is the name of a stream of measurements in a log."""
     return {channel.name: channel.section for sensor in registered().values() for channel in sensor.channels}
 
 

@@ -71,20 +71,19 @@ class Estimated:
 
     @staticmethod
     def of(names: Sequence[str], uncertainty: FileModel | None) -> Estimated:
-        """Return the constants among ``names`` with a standard deviation in ``uncertainty`` that is above zero."""
+        """Return the constants among ``names`` with a standard deviation above zero. ``uncertainty``: has the standard
+        deviations as attributes with these names."""
         return Estimated.among(names, np.array([getattr(uncertainty, name, 0.0) for name in names]))
 
     @staticmethod
     def among(names: Sequence[str], sigmas: Array) -> Estimated:
-        """Return the constants among ``names`` (M,) with standard deviations ``sigmas`` (M,) above zero."""
+        """Return the constants among ``names`` (M,) that are estimated: those with ``sigmas`` (M,) above zero."""
         indices = tuple(np.flatnonzero(sigmas).tolist())
         return Estimated(tuple(names[i] for i in indices), indices, sigmas[list(indices)])
 
     def full(self, values: Array, count: int) -> Array:
-        """Return an array (..., count) of all constants of the sensor, with the ``values`` (..., P) of the estimated ones.
-
-        The values of other constants are zero.
-        """
+        """Return an array (..., count) of all constants of the sensor: ``values`` (..., P) of the estimated ones, zeros
+        for the rest."""
         out = np.zeros((*np.shape(values)[:-1], count))
         out[..., list(self.indices)] = values
         return out
@@ -94,9 +93,9 @@ NOTHING = Estimated((), (), np.zeros(0))
 
 
 class SensorSettings(FileModel):
-    """The base class of the section of a sensor in a rig. ``constants``: names of calibration constants that may be estimated.
+    """The base class of the section of a sensor in a rig. ``constants``: names of its calibration constants.
 
-    The key ``uncertainty`` of the section has their standard deviations.
+    Constants with a standard deviation in the key ``uncertainty`` of the section may be estimated.
     """
 
     constants: ClassVar[tuple[str, ...]] = ()
@@ -108,14 +107,14 @@ class SensorSettings(FileModel):
         return Estimated.of(self.constants, getattr(self, "uncertainty", None))
 
     def map_error(self, world: World) -> Callable[[Array], Array] | None:
-        """Return a function from poses (N, 3) to covariances (N, 3, 3) of the map's error. Return None if the map is exact.
+        """Return a function from poses (N, 3) to covariances (N, 3, 3) of the map's error, None if the map is exact.
 
         At each pose, the map around it may be displaced and rotated by an error (x, y, heading) with this covariance.
         """
         return None
 
     def placed(self, folder: Path) -> Self:
-        """Return a copy for a rig file in ``folder``: names of files become relative to it."""
+        """Return a copy of these settings for a rig file in ``folder``: paths of files are relative to it."""
         return self
 
     def write_beside(self, folder: Path) -> None:

@@ -22,7 +22,8 @@ from factors.se2 import Array
 
 @dataclass(frozen=True)
 class Setup:
-    """The common arguments of all estimators: the robot, the map, the names of the sensors to use, and a random generator."""
+    """The common arguments of all estimators. ``rig``: the robot. ``world``: the map. ``sensors``: the names of the
+    sensors to use. ``rng``: a random generator."""
 
     rig: Rig
     world: World
@@ -30,7 +31,7 @@ class Setup:
     rng: np.random.Generator
 
     def alone(self, sensor: str) -> Setup:
-        """Return the arguments with ``sensor`` as the only sensor of its kind, see
+        """Return these arguments with ``sensor`` as the only sensor of its kind, see
         :meth:`~factorgraph_loc.model.rig.Rig.alone`."""
         return replace(self, rig=self.rig.alone(sensor), sensors=tuple(as_only(self.sensors, sensor)))
 
@@ -42,16 +43,16 @@ Calibration = Literal["all", "particles", "none"]
 
 @dataclass(frozen=True)
 class MapFrame:
-    """Accounts for the error of a map's frame in the world. The covariance of this error is added to priors and to estimates.
+    """Accounts for the error of a map's position in the world. Its covariance is added to priors and to estimates.
 
-    ``error``: a function from poses (N, 3) to covariances (N, 3, 3) of the error (x, y, heading). None if the map is exact.
+    ``error``: a function from poses (N, 3) to covariances (N, 3, 3) of the error (x, y, heading), or None.
     """
 
     error: Callable[[Array], Array] | None = None
 
     @classmethod
     def of(cls, setup: Setup, modalities: Container[str], landmarks: MapUse) -> MapFrame:
-        """Return the frame of the map of a run, from the settings of its sensors.
+        """Return the map error of a run, from the settings of its sensors.
 
         ``modalities``: the kinds of sensors that the estimator uses. ``landmarks``: how the estimator uses the map.
         """
@@ -63,26 +64,28 @@ class MapFrame:
         return cls()
 
     def prior(self, prior: PosePrior) -> PosePrior:
-        """Convert a start in the world frame to one in the frame of the map."""
+        """Return a prior in the world frame converted to the map frame: the covariance of the map error is added."""
         if self.error is None:
             return prior
         return replace(prior, covariance=prior.covariance + self.error(prior.pose[None])[0])
 
     def estimate(self, estimate: PoseEstimate) -> PoseEstimate:
-        """Convert an estimate in the frame of the map to one in the world frame."""
+        """Return an estimate in the map frame converted to the world frame, by adding the covariance of the map
+        error."""
         if self.error is None or estimate.status == "unlocalized":
             return estimate
         return replace(estimate, covariance=estimate.covariance + self.error(estimate.pose[None])[0])
 
     def belief(self, belief: Belief) -> Belief:
-        """Convert the modes of a belief to the world frame. Particles stay in the frame of the map."""
+        """Return a belief with the map error's covariance added to its modes. Limitation: the particles do not
+        change."""
         if self.error is None:
             return belief
         modes = (replace(m, covariance=m.covariance + self.error(m.pose[None])[0]) for m in belief.modes)
         return replace(belief, modes=tuple(modes))
 
     def trajectory(self, trajectory: Trajectory) -> Trajectory:
-        """Convert a trajectory in the frame of the map to one in the world frame."""
+        """Return a trajectory with the covariance of the map error added to its covariances."""
         if self.error is None or trajectory.covariances is None or not len(trajectory):
             return trajectory
         return replace(trajectory, covariances=trajectory.covariances + self.error(trajectory.poses))

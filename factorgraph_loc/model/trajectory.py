@@ -59,7 +59,7 @@ class Trajectory(Exchange):
         return PosePath(name, positions, upright(headings), checks.absolute(self.t, t0_ns), self.has_heading)
 
     def rows(self, which: Integers | NDArray[np.bool_]) -> Self:
-        """Return the poses at the indices ``which``, or where the mask ``which`` (N,) is True."""
+        """Return a trajectory of only the poses at the indices ``which``, or where the mask ``which`` (N,) is True."""
         covariances = None if self.covariances is None else self.covariances[which]
         return replace(self, t=self.t[which], poses=self.poses[which], covariances=covariances)
 
@@ -147,15 +147,16 @@ def neighbours(stamps: Array, t: Array, max_gap: float) -> tuple[Integers, Integ
 
 
 def averaged(covariances: Array, first: Integers, last: Integers, fraction: Array) -> Array:
-    """Return ``covariances`` (N, D, D) interpolated linearly to (M, D, D). The other arguments are from :func:`neighbours`."""
+    """Return ``covariances`` (N, D, D) interpolated linearly to (M, D, D). Other arguments are from
+    :func:`neighbours`."""
     weight = fraction[:, None, None]
     return np.asarray((1.0 - weight) * covariances[first] + weight * covariances[last])
 
 
 def write_tum(trajectory: Trajectory | PosePath, path: str | Path, t0_ns: int = 0) -> None:
-    """Write a TUM file with absolute timestamps in seconds, exact to the nanosecond.
+    """Write a trajectory to a TUM file, with absolute timestamps in seconds that are exact to the nanosecond.
 
-    ``t0_ns``: absolute time [ns] of t = 0 of a :class:`Trajectory`.
+    ``t0_ns``: absolute time [ns] of t = 0 of a :class:`Trajectory`. It is not used for a :class:`PosePath`.
     """
     stamps = checks.absolute(trajectory.t, t0_ns) if isinstance(trajectory, Trajectory) else trajectory.stamps()
     rows = []

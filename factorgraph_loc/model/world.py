@@ -38,7 +38,7 @@ class World(FileModel):
         def __getattr__(self, layer: str) -> Any: ...
 
     def of(self, kind: type[L]) -> dict[str, L]:
-        """Return the layer with elements of the class ``kind``, as {name: element}."""
+        """Return the layer of the map with elements of the class ``kind``, as {name: element}."""
         layer: dict[str, L] = getattr(self, next(name for name, of_layer in _KINDS.items() if of_layer is kind))
         return layer
 
