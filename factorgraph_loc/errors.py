@@ -33,7 +33,7 @@ class RunFailedError(FglocError):
 
 
 def bad_field(file: object, field: str, value: object, expected: str, *, row: int | None = None) -> InputError:
-    """Return the error for an invalid value: "FILE:ROW: FIELD is VALUE, expected EXPECTED". ``row``: a line number, or None."""
+    """Return the error for an invalid value: "FILE:ROW: FIELD is VALUE, expected EXPECTED". ``row``: line number."""
     where = f"{plain(file)}:{row}" if row is not None else plain(file)
     return InputError(f"{where}: {plain(field)} is {quoted(value)}, expected {expected}")
 
@@ -46,9 +46,10 @@ def require(
     values: NDArray[Any],
     expected: str,
 ) -> None:
-    """Raise the error of :func:`bad_field` at the first invalid value, if any.
+    """Raise the error of :func:`bad_field` at the first of the ``values`` (N, ...) that is invalid, if any.
 
-    ``valid`` (N,): a mask of the ``values`` (N, ...) that are valid. ``rows`` (N,): line numbers of the values in ``file``.
+    ``valid`` (N,): a mask of the valid values. ``rows`` (N,): line numbers of the values in ``file``. ``field``: the
+    name of the values. ``expected``: a description of valid values.
     """
     if not valid.all():
         i = int(valid.argmin())

@@ -31,8 +31,8 @@ class Group(Mapping[str, Any]):
     """A registry of plug-ins of one kind. ``group[name]`` imports the plug-in of that name and returns it.
 
     ``kind``: name of the kind, such as "sensors". ``own``: import paths of the built-in plug-ins by name. ``needs``:
-    names of the attributes that a plug-in must have. Access raises InputError if a plug-in of another package cannot be
-    imported, lacks an attribute, or has a name that is already registered.
+    names of the attributes that a plug-in must have. Getting a plug-in raises InputError if it is of another package
+    and cannot be imported, lacks an attribute, or has a name that is already registered.
     """
 
     def __init__(self, kind: str, *needs: str) -> None:
@@ -41,11 +41,11 @@ class Group(Mapping[str, Any]):
         self._others: dict[str, tuple[Place, str]] | None = None  # plug-ins of other packages: import path and package
 
     def place(self, name: str) -> Place:
-        """Return the import path of the plug-in ``name``. Raises KeyError if the name is unknown."""
+        """Return the import path of a plug-in, such as "package.module". Raises KeyError if ``name`` is unknown."""
         return self.own[name] if name in self.own else self._installed()[name][0]
 
     def _installed(self) -> dict[str, tuple[Place, str]]:
-        """Return the plug-ins of other packages by name: the import path, and the name of the package."""
+        """Return (import path, name of the package) of each plug-in of other packages, by the name of the plug-in."""
         if self._others is None:
             from importlib.metadata import entry_points  # noqa: PLC0415 - most commands need built-in ones only
 

@@ -57,8 +57,8 @@ class Child(SpawnProcess):
 class Worker:
     """A worker process of :func:`run_each`.
 
-    ``connection``: the parent's end of the connection to the process. ``ready``: whether the process has loaded its
-    modules. ``job``: the current job, or None.
+    ``process``: the process. ``connection``: this process's end of the pipe to it. ``ready``: whether it has loaded its
+    modules. ``job``: the index of its current job, or None.
     """
 
     process: Child
@@ -93,10 +93,10 @@ class Worker:
 
 
 def start(function: Callable[..., None], *args: Any) -> tuple[Child, Connection]:
-    """Start a process that calls ``function(connection, *args)``. ``connection`` leads to this process.
+    """Start a process that calls ``function(connection, *args)``. Return the process, and this end of a pipe to it.
 
-    Return the new process, and this process's end of the connection. ``function`` must be defined in a module that can
-    be imported, not in the running script. The new process ignores keyboard interrupts.
+    ``connection`` is the other end of the pipe. ``function`` must be defined in a module that can be imported, not in
+    the running script. The new process ignores keyboard interrupts.
     """
     use_one_thread()
     parent_end, child_end = Pipe()
@@ -153,7 +153,8 @@ class RemoteError(Exception):
 
 
 def serve(connection: Connection, *modules: str) -> None:
-    """Run the main loop of a worker process. ``modules``: names of modules that are imported first.
+    """Run the main loop of a worker process. ``connection``: its end of a pipe. ``modules``: names of modules to import
+    first.
 
     The process receives a function from ``connection``, and then jobs. It calls the function on each job, and sends the
     value or the exception back.

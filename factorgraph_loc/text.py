@@ -41,12 +41,12 @@ class Notice:
         return hash(str(self))
 
     def about(self, name: str) -> "Notice":
-        """Return the notice with a ``name``, such as the name of a log or file, in front of the sentence."""
+        """Return the notice with ``name``, such as the name of a log or file, in front of its text."""
         return Notice(self.kind, "{about}: " + self.sentence, {"about": name, **self.fields})
 
 
 def notice(kind: str, sentence: str, *values: object) -> Notice:
-    """Return a :class:`Notice`. ``values``: a value for each name in braces in ``sentence``, in order of appearance."""
+    """Return a :class:`Notice`. ``values``: replace the names in braces in ``sentence``, in order of appearance."""
     names = dict.fromkeys(name for _, name, _, _ in Formatter().parse(sentence) if name)
     numbers = (value.item() if hasattr(value, "item") else value for value in values)
     plainly = (value if isinstance(value, int | float | str) else str(value) for value in numbers)
@@ -54,7 +54,7 @@ def notice(kind: str, sentence: str, *values: object) -> Notice:
 
 
 def number(value: float | None, digits: int = 4) -> str:
-    """Return a number as text. ``digits``: how many follow the decimal point. Return "-" for None, NaN and infinity."""
+    """Return a number as text with ``digits`` digits after the decimal point. Return "-" for None, NaN and infinity."""
     return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
 
 

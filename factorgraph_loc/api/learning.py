@@ -32,10 +32,12 @@ def calibrate(
     overwrite: bool = False,
     progress: Callable[[float, float], None] | None = None,
 ) -> calibration.Calibration:
-    """Calibrate a rig from logs, and write it to ``out`` (``NAME.rig.toml``), with a report ``NAME.report.html`` next to it.
+    """Calibrate a rig, the settings of a robot and its sensors, from logs. Write it and a report; return the
+    calibration.
 
-    Either all logs or none must have a reference trajectory. ``progress`` is called with the number of steps that are
-    done and the number of all steps.
+    ``out``: the rig file, ``NAME.rig.toml``; the report is ``NAME.report.html`` next to it. ``rig``, ``world``: replace
+    those of the logs. Either all logs or none must have a reference trajectory. ``progress`` is called with the number
+    of finished steps and the number of all steps.
     """
     file, page = Path(out), report_beside(Path(out), overwrite=overwrite)
     loaded = load_all(logs, rig, world)
@@ -50,7 +52,10 @@ def calibrate(
 
 
 def report_beside(out: Path, *, overwrite: bool) -> Path:
-    """Return the path of the report next to the rig file ``out``. Raises InputError if a file exists without ``overwrite``."""
+    """Return the path of the report next to the rig file ``out``.
+
+    Raises InputError if one of the two files exists and ``overwrite`` is False.
+    """
     return output.with_ending(out, RIG, ".report.html", overwrite=overwrite)
 
 
@@ -72,10 +77,11 @@ def build_map(
     overwrite: bool = False,
     progress: maps.Progress = lambda _share: None,
 ) -> maps.MadeMap:
-    """Estimate a map of landmarks, RFID tags or points from a log. Writes ``out`` (``NAME.world.toml``) and a picture next to it.
+    """Estimate a map of landmarks, RFID tags or points from a log, and return it.
 
-    The other arguments are those of :class:`~factorgraph_loc.experiments.maps.MapOptions`. ``progress`` is called with
-    the fraction of the work that is done.
+    Writes ``out`` (``NAME.world.toml``) and a picture next to it. ``rig``, ``world``: replace those of the log.
+    ``progress`` is called with the fraction of the work that is done. For the other arguments see
+    :class:`~factorgraph_loc.experiments.maps.MapOptions`.
     """
     maps.plot_path(Path(out), overwrite=overwrite)
     options = maps.MapOptions(of, estimator, settings or {}, extend, poses, height, prior, drop_dead, points or {})
@@ -93,11 +99,12 @@ def features(
     overwrite: bool = False,
     progress: Callable[[float, float], None] = lambda _done, _total: None,
 ) -> pl.DataFrame:
-    """Evaluate point features on ``images`` of planar scenes, and write the scores to the folder ``out``.
+    """Evaluate point features on ``images`` of planar scenes. Return a table of scores, and write it to the folder
+    ``out``.
 
     ``images``: folders of image sequences, or photographs. Known homographies warp photographs to image sequences.
-    ``features``: names of the features to compare.
-    ``count``: maximum number of features in an image. ``progress`` is called with the numbers of done and of all images.
+    ``features``: names of the features to compare. ``count``: maximum number of features in an image. ``progress`` is
+    called with the number of finished images and the number of all images.
     """
     require_free(Path(out), feature_scores.FILES, overwrite=overwrite)
     chosen = [Feature(name, extractor(name, count).detectAndCompute) for name in features]

@@ -25,14 +25,18 @@ from factorgraph_loc.simulation import simulate as make_log
 
 
 def datasets(data_root: str | Path | None = None) -> list[Dataset]:
-    """Return the known data sets. Their names can be given as logs. ``data_root``: the folder of their files."""
+    """Return descriptions of the known data sets. Their names can be given as logs. ``data_root``: the folder of their
+    files."""
     return describe(data_root)
 
 
 def info(
     log: LogLike, *, rig: RigLike | None = None, world: WorldLike | None = None, out: str | Path | None = None
 ) -> Inspection:
-    """Return a summary of a log, with warnings about its content. ``out``: a PNG file to write, a picture of the log from above."""
+    """Return a summary of a log, with warnings about its content.
+
+    ``rig``, ``world``: replace those of the log. ``out``: a PNG file to write, a picture of the log from above.
+    """
     loaded = read_log(log, rig=rig, world=world)
     if out is not None:
         draw([loaded], Path(out))
@@ -40,8 +44,8 @@ def info(
 
 
 def draw(logs: Sequence[Log], path: Path) -> None:
-    """Write a picture of the log in ``logs`` to ``path``. Raises InputError if there is not exactly one log, or if
-    ``path`` does not end in .png."""
+    """Write a picture of a log from above to ``path``. ``logs``: a list with this log. Raises InputError if it has not
+    exactly one log, or if ``path`` does not end in .png."""
     if path.suffix.lower() != ".png":
         raise InputError(f"{path}: expected a name that ends in .png")
     if len(logs) != 1:
@@ -61,7 +65,11 @@ def convert(
     world: WorldLike | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write a log as the folder ``out`` in the native format. ``overwrite``: replace a log in the folder ``out``."""
+    """Write a log as the folder ``out`` in the native format of this project.
+
+    ``format``: of the tables. ``rig``, ``world``: replace those of the log. ``overwrite``: replace a log in the folder
+    ``out``.
+    """
     write_native(read_log(log, rig=rig, world=world), out, format, overwrite=overwrite)
 
 
@@ -85,11 +93,11 @@ def simulate(
     out: str | Path | None = None,
     progress: Callable[[float, float], None] = lambda _done, _total: None,
 ) -> Log:
-    """Simulate a log with known ground truth. The same seed gives the same bytes.
+    """Return a simulated log with known ground truth. The same seed gives the same bytes.
 
     ``what``: a preset, a TOML file, or settings. ``changes``: changed settings as nested tables, such as ``{"drive":
     {"duration": 60.0}}``. ``images``: render the images of the camera into ``out``. ``out``: a new folder for the log
-    in the native format. ``progress`` is called with the numbers of rendered and of all images.
+    in the native format. ``progress`` is called with the number of rendered images and the number of all images.
     """
     if isinstance(what, SimulationSettings) and changes:
         raise InputError("changes apply to a preset or a file, but settings are given: change the settings themselves")

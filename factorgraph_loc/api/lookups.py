@@ -42,7 +42,8 @@ class NamedSettings:
 
 @dataclass(frozen=True)
 class SensorDescription:
-    """A sensor. ``about``: its description. ``channels``: the names that the option ``--sensors`` has for it.
+    """A sensor. ``about``: its description. ``channels``: the names of such sensors that the option ``--sensors``
+    accepts.
 
     ``tables``: the columns of each table by its name. ``rig``: the settings of each section of the rig by its name.
     """
@@ -55,12 +56,12 @@ class SensorDescription:
 
 
 def known_estimators() -> list[Description]:
-    """Return the estimators, each with the sensors that it uses and its settings."""
+    """Return a description of each estimator: the sensors that it uses, and its settings."""
     return [describe(name) for name in ESTIMATORS]
 
 
 def known_readers() -> list[NamedSettings]:
-    """Return the readers of logs, each with its options."""
+    """Return a description of each reader of logs, with its options."""
     return [describe_reader(name) for name in READERS]
 
 
@@ -71,7 +72,7 @@ def describe_reader(name: str) -> NamedSettings:
 
 
 def known_sensors() -> list[SensorDescription]:
-    """Return the sensors, each with the columns of its tables and its settings in the rig."""
+    """Return a description of each sensor, with the columns of its tables and its settings in the rig."""
     return [describe_sensor(name) for name in SENSORS]
 
 
@@ -94,7 +95,7 @@ def describe_sensor(name: str) -> SensorDescription:
 
 
 def known_presets() -> list[NamedSettings]:
-    """Return the presets of simulations, each with its settings."""
+    """Return a description of each preset of simulations, with its settings."""
     return [describe_preset(name) for name in PRESETS]
 
 
@@ -105,18 +106,21 @@ def describe_preset(name: str) -> NamedSettings:
 
 
 def known_policies() -> list[NamedSettings]:
-    """Return the policies of active localization, each with the settings of a run."""
+    """Return a description of each policy of active localization, with the settings that all policies share."""
     settings = tuple(settings_in(ActiveSettings))
     return [NamedSettings(name, about, settings) for name, about in POLICIES.items()]
 
 
 def known_rigs() -> dict[str, Rig]:
-    """Return by name the rigs of known logs and of simulations, and the default rig."""
+    """Return the rigs of known logs and of simulations, and the default rig, by name."""
     return {name: make() for name, (_, make) in sources_of_rigs().items()}
 
 
 def sources_of_rigs() -> dict[str, tuple[str, Callable[[], Rig]]]:
-    """Return by name, for each known rig, a text that says which logs it is for, and a function that makes it."""
+    """Return (text, function) for each known rig, by its name.
+
+    The text states which logs the rig is for. The function takes no arguments and returns the rig.
+    """
     default: dict[str, tuple[str, Callable[[], Rig]]] = {"default": ("logs without a rig", lambda: DEFAULT_RIG)}
     recorded = {name: ("a known log", partial(read_rig, file)) for name, file in shipped().items()}
     return default | recorded | {name: ("fgloc simulate", lambda name=name: preset(name).rig) for name in PRESETS}
@@ -149,7 +153,10 @@ def new_rig(
 
 
 def write_new_rig(rig: Rig, remarks: list[str], file: Path, *, overwrite: bool) -> None:
-    """Write a rig with remarks and the meaning of each key. Raises InputError if the file exists and ``overwrite`` is false."""
+    """Write a rig with a comment on each key. ``remarks``: comments at the beginning of the file.
+
+    Raises InputError if the file exists and ``overwrite`` is False.
+    """
     if file.exists() and not overwrite:
         raise InputError(f"{file}: exists already: choose another name, or use --overwrite")
     write_text(file, rig_text(rig, [ADVICE, *remarks]))

@@ -70,7 +70,7 @@ def _listed(results: LogLike | Sequence[LogLike]) -> list[LogLike]:
 
 
 def stored(results: Sequence[L], read: Callable[[L | str], Log]) -> tuple[Log, list[StoredRun]]:
-    """Return the log and the runs in ``results``. ``read``: a function that reads a log.
+    """Return the log and the stored runs that the names ``results`` refer to. ``read``: a function that reads a log.
 
     If ``results`` has no log, the known data set that the runs name is read. Raises InputError if there is none, or if
     there are several logs.
@@ -124,7 +124,10 @@ def require_format(out: Path) -> None:
 
 
 def write(log: Log, runs: list[StoredRun], out: Path) -> list[Path]:
-    """Write a log and its runs, a trajectory, or points of a map, in the format of the suffix of ``out``. Returns the files."""
+    """Write results in the format that the suffix of ``out`` selects, and return the written files.
+
+    They are a log and its runs, a trajectory, or points of a map.
+    """
     if out.suffix == ".mcap":
         write_mcap(log, runs, out)
     elif out.suffix == ".ply":

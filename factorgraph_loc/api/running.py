@@ -59,14 +59,14 @@ def run(
     overwrite: bool = False,
     progress: Callable[[float], None] | None = None,
 ) -> Run:
-    """Run one estimator on one log and score the result.
+    """Run one estimator on one log. Return the estimates and their scores.
 
     ``settings``: values that replace settings of the estimator. ``sensors``: names of the sensors to use. ``prior``:
-    the start pose, "X,Y,HEADING" or a name such as "reference". ``seed``: the seed of the random generator.
-    ``learn``: estimate the constants of the rig from the log itself. Only the final trajectory uses these estimates.
-    ``align``: unless it is "none", there are also scores after this alignment with the reference trajectory.
-    ``out``: a folder for the files of ``fgloc run``. ``progress`` is called with the fraction of the work that is done.
-    For ``max_gap`` and ``tick_gap`` see :class:`~factorgraph_loc.model.scoring.RunConfig`.
+    the start pose, "X,Y,HEADING" or a name such as "reference". ``seed``: the seed of the random generator. ``learn``:
+    estimate the constants of the rig from the log itself. Only the final trajectory uses these estimates. ``align``:
+    unless it is "none", there are also scores after this alignment with the reference trajectory. ``out``: a folder for
+    the files of ``fgloc run``. ``progress`` is called with the fraction of the work that is done. ``rig``, ``world``:
+    replace those of the log. For ``max_gap`` and ``tick_gap`` see :class:`~factorgraph_loc.model.scoring.RunConfig`.
     """
     if out is not None:
         require_free(Path(out), FILES, overwrite=overwrite)
@@ -90,11 +90,12 @@ def run(
 def run_and_learn(
     log: Log, config: RunConfig, progress: Callable[[float], None] | None = None
 ) -> tuple[RunResult, Knowledge]:
-    """Run an estimator on a log, estimate the rig from the same log, and compute the final trajectory with the estimated rig.
+    """Run an estimator on a log and estimate the rig from the same log. Return the result, and the estimated rig.
 
-    The estimated rig depends on the whole log. Therefore only the final trajectory uses it, and causal estimates use
-    the given rig. The configuration in the result has the estimated rig as ``learnt_rig``. ``progress`` is called with
-    the fraction of the work that is done. Raises InputError if the log has too little information.
+    The rig, the settings of a robot and its sensors, is estimated from the whole log. Therefore only the final
+    trajectory uses the estimated rig, and causal estimates use the given rig. The configuration in the result has the
+    estimated rig as ``learnt_rig``. ``progress`` is called with the fraction of the work that is done. Raises
+    InputError if the log has too little information.
     """
     report = progress or (lambda _share: None)
     runs = TURNS + 2

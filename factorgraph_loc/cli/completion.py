@@ -50,7 +50,7 @@ map_estimator = _one_of(lambda: MAP_ESTIMATORS)
 
 
 def setting(incomplete: str) -> list[str]:
-    """Return the completions of an estimator's setting NAME.KEY=VALUE: first of the name NAME, then of the key KEY."""
+    """Return completions of an option NAME.KEY=VALUE: "NAME.", or "NAME.KEY=" if ``incomplete`` has a dot."""
     name, dot, _ = incomplete.partition(".")
     if not dot:
         return [f"{known}." for known in estimator(name)]
@@ -63,7 +63,7 @@ def setting(incomplete: str) -> list[str]:
 
 
 def simulation_setting(incomplete: str) -> list[str]:
-    """Return the completions of the key in a setting KEY=VALUE of a simulation. Keys ``rig.KEY`` are not proposed."""
+    """Return the completions "KEY=" of a setting KEY=VALUE of a simulation. Keys ``rig.KEY`` are not proposed."""
     from factorgraph_loc.files.settings import settings_in
     from factorgraph_loc.simulation import SimulationSettings
 
@@ -72,7 +72,7 @@ def simulation_setting(incomplete: str) -> list[str]:
 
 
 def active_setting(incomplete: str) -> list[str]:
-    """Return the completions of the key in a setting KEY=VALUE of ``fgloc active``."""
+    """Return the completions "KEY=" of a setting KEY=VALUE of ``fgloc active``."""
     from factorgraph_loc.files.settings import settings_in
     from factorgraph_loc.planning.settings import ActiveSettings
 

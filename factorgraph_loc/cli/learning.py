@@ -188,7 +188,7 @@ def print_elements(made: Made) -> tuple[str, ...]:
 
 
 def document(made: Made) -> dict[str, Any]:
-    """Return a new map as a dictionary for the option ``--json``."""
+    """Return the dictionary that ``--json`` prints for a new map: its elements, a summary and notes."""
     from factorgraph_loc.mapping.mapping import LandmarkMap
     from factorgraph_loc.mapping.tag_mapping import MadeTags
 
@@ -228,7 +228,7 @@ def _rows(made: LandmarkMap, verdicts: Mapping[str, str]) -> list[tuple[str, ...
 
 
 def _entries(made: LandmarkMap, verdicts: Mapping[str, str]) -> dict[str, dict[str, Any]]:
-    """Return a dictionary of values for each landmark or tag, by its name.
+    """Return by name, for each landmark or tag, its given and estimated position, their distance, and a verdict.
 
     ``verdicts``: for some names, texts that replace the verdict in ``made``."""
     return {
@@ -246,7 +246,7 @@ def _entries(made: LandmarkMap, verdicts: Mapping[str, str]) -> dict[str, dict[s
 
 
 def _reasons(made: MadeTags) -> dict[str, str]:
-    """Return the reason why a tag could not be located, by the name of each such tag."""
+    """Return, by the name of each tag that could not be located, the reason."""
     return {name: str(why) for name, why in made.open.items()}
 
 
@@ -257,7 +257,7 @@ def _notes(made: LandmarkMap) -> list[str]:
 
 
 def _notes_on_tags(made: MadeTags) -> list[str]:
-    """Return lines to print below the table: notes, tags that are not located, the distance from given positions."""
+    """Return lines to print below the table of tags: notes, tags without a position, distances from given positions."""
     listed = {entry.landmark for entry in made.made.entries}
     unmapped = {name: why for name, why in made.open.items() if name not in listed}
     lines = [*map(str, made.made.notes)]

@@ -100,13 +100,13 @@ class LogOptions:
     ] = None
 
     def load(self, names: Sequence[str]) -> list[Log]:
-        """Read the logs with the given names. One name may refer to several logs."""
+        """Read the logs with the given names and return them. One name may refer to several logs."""
         from factorgraph_loc.io.readers import load
 
         return [log for name in names for log in load(name, **self._given())]
 
     def load_one(self, name: str) -> Log:
-        """Read the log with a given name. Raises InputError if the name refers to several logs."""
+        """Read the log with a given name and return it. Raises InputError if the name refers to several logs."""
         from factorgraph_loc.io.readers import read_log
 
         return read_log(name, **self._given())
@@ -150,15 +150,16 @@ class RunOptions:
     overwrite: Overwrite = False
 
     def given(self) -> dict[str, Any]:
-        """Return the options as keyword arguments for the functions ``run`` and ``compare``, except the settings."""
+        """Return all options except ``--set`` as keyword arguments for the functions ``run`` and ``compare``."""
         given = {key: value for key, value in vars(self).items() if key not in ("set_", "rpe")}
         return given | {"sensors": parse_list(self.sensors) if self.sensors else None}
 
 
 def takes_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Decorate a command that has parameters whose types are dataclasses, such as :class:`LogOptions`.
+    """Decorate a command that has dataclasses as arguments, such as :class:`LogOptions`. Return the decorated command.
 
-    On the command line each field of such a dataclass is an option of its own. The command receives the filled dataclasses.
+    On the command line, each field of such a dataclass is an option of its own. The command is called with instances of
+    the dataclasses, which contain the values of the options.
     """
     given = inspect.signature(command, eval_str=True)
     groups: dict[str, Any] = {p.name: p.annotation for p in given.parameters.values() if is_dataclass(p.annotation)}
@@ -232,7 +233,7 @@ def key_and_value(text: str, option: str) -> tuple[str, Any]:
 
 
 def _scalar(text: str) -> Any:
-    """Parse a value of TOML. Return the text of a date, and a text that is not TOML, unchanged."""
+    """Return the value of a TOML text, such as 3 for "3". Return a date, and a text that is not TOML, unchanged."""
     from factorgraph_loc.files.models import parse_toml
 
     try:

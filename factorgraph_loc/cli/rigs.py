@@ -120,11 +120,11 @@ def new(
 
 
 def _value(option: str, given: str | None, default: str, expected: str, parse: Callable[[str], T], asks: bool) -> T:
-    """Return the parsed value of an option.
+    """Return the value of ``option``, parsed by ``parse``, which raises KeyError or ValueError for an invalid text.
 
-    ``given``: the text on the command line, None if the option is missing. If it is missing and ``asks`` is true, the
-    user is asked until the answer is valid. ``default``: the text without an answer. ``expected``: describes valid
-    texts. ``parse`` raises KeyError or ValueError for an invalid text. Raises InputError if ``given`` is invalid."""
+    ``given``: the text on the command line, None if the option is missing. If it is missing and ``asks`` is True, the
+    user is asked until the answer is valid. ``default``: the text to use without an answer. ``expected``: describes
+    valid texts. Raises InputError if ``given`` is invalid."""
     while True:
         text = default if given is None else given
         if given is None and asks:

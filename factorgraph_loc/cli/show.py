@@ -37,7 +37,7 @@ def note(text: str) -> None:
 
 
 def warnings(doubts: Sequence[object]) -> None:
-    """Print the first :data:`WARNINGS` warnings on stderr, one per line, and the number of the remaining ones."""
+    """Print the first :data:`WARNINGS` of the warnings ``doubts`` on stderr, one per line, and the number of more."""
     for doubt in doubts[:WARNINGS]:
         note(f"warning: {one_line(str(doubt))}")
     if len(doubts) > WARNINGS:
@@ -45,7 +45,7 @@ def warnings(doubts: Sequence[object]) -> None:
 
 
 def outcome(doubts: Sequence[str], failures: Sequence[str], most: int | None = None, more: str = "") -> None:
-    """Print warnings and failures of several runs on stderr, one per line.
+    """Print the warnings ``doubts`` and the texts ``failures`` of several runs on stderr, one per line.
 
     ``most``: maximum number of failures to print, None for all. ``more``: end of the line "failed: N more", which is
     printed if there are further failures.
@@ -58,7 +58,7 @@ def outcome(doubts: Sequence[str], failures: Sequence[str], most: int | None = N
 
 
 def document(content: Any) -> None:
-    """Print a JSON document on stdout; NaN and infinity become null, non-printable characters are escaped."""
+    """Print ``content`` as JSON on stdout. NaN and infinity become null, non-printable characters are escaped."""
     unicode = sys.stdout.encoding.lower().startswith("utf")
     text = json.dumps(plain_values(content), indent=2, ensure_ascii=not unicode)
     print("".join(c if c == "\n" or c.isprintable() else json.dumps(c)[1:-1] for c in text), flush=True)
@@ -162,7 +162,7 @@ class _Forecast:
 
 
 def fields(content: Mapping[str, str]) -> None:
-    """Print each name and value of ``content`` on a line."""
+    """Print each name of ``content`` and its value on a line."""
     width = max(map(len, content))
     for name, value in content.items():
         line(f"{name:<{width}}  {value}")

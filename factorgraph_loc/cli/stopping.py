@@ -62,10 +62,11 @@ def unwrapped() -> Iterator[None]:
 
 @contextmanager
 def stoppable() -> Iterator[None]:
-    """Raise :class:`Stop` when a signal of :data:`WORDS` arrives in this block. Signals that the process ignores stay ignored.
+    """Raise :class:`Stop` if a signal of :data:`WORDS` arrives in this block. Signals that the process ignores stay
+    ignored.
 
-    A second signal ends the process immediately. Python drops exceptions in destructors and callbacks. If it drops a
-    :class:`Stop`, the signal is sent again.
+    A second signal ends the process immediately. Limitation: Python drops exceptions in destructors and callbacks. If
+    it drops a :class:`Stop`, the signal is sent again.
     """
     handlers: dict[signal.Signals, Any] = {}
     hook = sys.unraisablehook

@@ -56,7 +56,7 @@ def view(
 
 
 def shown(log: Log, runs: list[StoredRun]) -> dict[str, Any]:
-    """Return a dictionary for the option ``--json``: the name of the log, and the names and folders of the runs."""
+    """Return the dictionary that ``--json`` prints: the name of the log, and the name and folder of each run."""
     return {"log": log.name, "runs": {run.name: str(run.folder.path) for run in runs}}
 
 

@@ -35,7 +35,7 @@ _LABEL, _LEGEND, _SIGN = 60, 190, 13  # characters: maximum of a label, of a lin
 
 
 def empty(height: float, title: str = "") -> Figure:
-    """Return a figure without axes. ``height``: in units of 100 px."""
+    """Return a figure without axes. ``height``: its height in units of 100 px. ``title``: the text above the figure."""
     # Figure without pyplot: no global state, no display, and matplotlib is imported only when something is plotted
     from matplotlib.backends.backend_agg import FigureCanvasAgg  # noqa: PLC0415
     from matplotlib.figure import Figure  # noqa: PLC0415
@@ -86,7 +86,7 @@ def ellipses(centres: Array, covariances: Array, scale: float) -> Array:
 
 
 def legend(figure: Figure, axes: Iterable[Axes], markers: float = 1.0) -> None:
-    """Add one legend below all ``axes`` of a figure. ``markers``: size of markers in the legend, relative to the plot."""
+    """Add one legend below all ``axes``. ``markers``: size of its markers relative to the markers in the axes."""
     entries: dict[str, Any] = {}
     for axis in axes:
         for handle, label in zip(*axis.get_legend_handles_labels(), strict=True):
@@ -100,7 +100,7 @@ def legend(figure: Figure, axes: Iterable[Axes], markers: float = 1.0) -> None:
 
 @contextmanager
 def drawing(figure: Figure) -> Iterator[None]:
-    """Prepare the texts of a figure, and suppress warnings while it is drawn in this block.
+    """Prepare the texts of a figure for drawing in this block, and suppress warnings meanwhile.
 
     A ``$`` in a text is drawn and does not start a formula. Long lines are shortened. The suppressed warnings are about
     missing glyphs and about labels that leave no room for the axes.
@@ -115,12 +115,12 @@ def drawing(figure: Figure) -> Iterator[None]:
 
 
 def png(figure: Figure) -> Picture:
-    """Return the figure as a PNG image for a page."""
+    """Return the figure as a PNG image that can be embedded in an HTML page."""
     return Picture.of("image/png", png_bytes(figure))
 
 
 def svg(figure: Figure) -> Picture:
-    """Return the figure as an SVG image for a page. The same figure always gives the same bytes."""
+    """Return the figure as an SVG image that can be embedded in an HTML page. Equal figures give equal bytes."""
     from matplotlib import rc_context  # noqa: PLC0415
 
     out = io.BytesIO()
@@ -131,7 +131,7 @@ def svg(figure: Figure) -> Picture:
 
 
 def png_bytes(figure: Figure) -> bytes:
-    """Return the figure as a PNG with 256 colours, which is a third as large as a PNG in full colour."""
+    """Return the bytes of a PNG file of the figure, with 256 colours."""
     from PIL.Image import Dither, Quantize  # noqa: PLC0415
 
     out = io.BytesIO()

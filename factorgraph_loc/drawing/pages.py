@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 
 
 class Cell(NamedTuple):
-    """A cell of a table. ``value``: main text. ``lines``: smaller lines below it. ``kind``: CSS class, "" for none.
+    """A cell of an HTML table. ``value``: main text. ``lines``: smaller lines below it. ``kind``: CSS class, "" for
+    none.
 
     ``colour``: index of the colour of a mark in the cell, None for no mark.
     """
@@ -57,9 +58,10 @@ def render(template: str, **values: Any) -> str:
 
 
 def sectioned(title: str, lead: str, doubts: Sequence[Notice], sections: Mapping[str, Sequence[Part]]) -> str:
-    """Return an HTML page with headings. ``lead``: the introduction. ``doubts``: warnings, which are highlighted.
+    """Return an HTML page with a heading for each section.
 
-    ``sections``: the paragraphs, tables and pictures of each section, by its heading.
+    ``lead``: the introduction. ``doubts``: warnings, which are highlighted. ``sections``: by heading, the parts of a
+    section, each a paragraph, a table or a picture.
     """
     names = {f"section-{i}": name for i, name in enumerate(sections)}
     parts = dict(zip(names, sections.values(), strict=True))

@@ -43,7 +43,7 @@ ARROW = 0.6  # m: length of the arrow of a heading
 
 
 def write_rrd(log: Log, runs: Sequence[StoredRun], path: Path) -> None:
-    """Write a log and its runs to a file that ``rerun FILE`` opens.
+    """Write a log and the estimates of runs on it to a file that the command ``rerun FILE`` shows.
 
     Raises InputError if an image cannot be read, or the file cannot be written.
     """
@@ -58,7 +58,7 @@ def write_rrd(log: Log, runs: Sequence[StoredRun], path: Path) -> None:
 
 
 def show(log: Log, runs: Sequence[StoredRun], bind: str = LOOPBACK) -> None:
-    """Show a log and its runs in the Rerun viewer. A new viewer is started unless one is open.
+    """Show a log and the estimates of runs on it in the Rerun viewer. A new viewer is started unless one is open.
 
     ``bind``: the IP address at which a new viewer listens. The default accepts only connections from this machine.
     Raises InputError if an image cannot be read, if there is no display, or if the viewer does not start.
@@ -225,7 +225,10 @@ def _pixels_over_time(
 
 
 def _predicted_pixels(model: reprojection.CameraModel, pose: Array, points: Array) -> Array:
-    """Return the pixels (K, 2) of the nearest visible ``points`` (P, 3). K is 0 if the robot's ``pose`` (3,) is NaN."""
+    """Return the pixels (K, 2) of at most :data:`NEAREST` visible ``points`` (P, 3), sorted by distance from the
+    camera.
+
+    ``pose`` (3,): x, y, heading of the robot. K is 0 if it is NaN."""
     if not np.isfinite(pose).all():
         return np.empty((0, 2))
     pixels, depths = reprojection.predict(model, pose, points)

@@ -25,7 +25,8 @@ PATIENCE = 30.0  # s: maximum time for the viewer to start
 
 @contextmanager
 def open_viewer(bind: str) -> Iterator[str]:
-    """Yield the URL of a viewer for :meth:`rerun.RecordingStream.connect_grpc`. Starts a viewer unless one is open.
+    """Yield the URL of a Rerun viewer, for :meth:`rerun.RecordingStream.connect_grpc`. Starts a viewer unless one is
+    open.
 
     A new viewer listens on the IP address ``bind`` and stays open after the end of this process. Raises InputError if
     ``bind`` is no IP address, if the viewer does not start, or if it is closed before the end of the block.
@@ -71,7 +72,8 @@ def _is_listening(host: str) -> bool:
 
 
 def _start(bind: str, printed: BinaryIO) -> "subprocess.Popen[bytes]":
-    """Start the viewer in its own session, so that it stays open when the terminal is closed.
+    """Start the viewer and return its process. It has its own session, so that it stays open when the terminal is
+    closed.
 
     ``bind``: the IP address at which the viewer listens. ``printed``: a file for the output of the viewer."""
     command = [*COMMAND, "--bind", bind, "--port", str(PORT), "--expect-data-soon"]
@@ -79,7 +81,7 @@ def _start(bind: str, printed: BinaryIO) -> "subprocess.Popen[bytes]":
 
 
 def _reason(printed: BinaryIO) -> str:
-    """Return ": " and the error in the output of the viewer, or "" if there is none."""
+    """Return ": " followed by the error in the output ``printed`` of the viewer, or "" if it has no error."""
     printed.seek(0)
     lines = printed.read().decode(errors="replace").splitlines()
     return next((f": {line.removeprefix('Error: ')}" for line in lines if line.startswith(("Error", "thread "))), "")

@@ -141,7 +141,7 @@ class _Maker:
         return self._types[kind.replace("/", "/msg/")](**fields)
 
     def message(self, t_ns: int, topic: str, kind: str, **fields: Any) -> Message:
-        """Return a message with its time ``t_ns`` [ns], topic and type."""
+        """Return (time ``t_ns`` [ns], topic, type, ROS message). ``kind``: the type. ``fields``: its values."""
         return t_ns, topic, kind.replace("/", "/msg/"), self(kind, **fields)
 
     def header(self, t_ns: int, frame: str) -> Any:
@@ -167,7 +167,7 @@ class _Maker:
         return self.message(start_ns, topic, "nav_msgs/Path", header=self.header(start_ns, MAP), poses=poses)
 
     def markers(self, t_ns: int, topic: str, shapes: Sequence[Mapping[str, Any]]) -> Message:
-        """Return a MarkerArray message of ``shapes`` from :meth:`shape` and :meth:`dots`."""
+        """Return (time [ns], topic, type, MarkerArray). ``shapes``: the values of :meth:`shape` and :meth:`dots`."""
         empty = {
             "header": self.header(t_ns, MAP),
             "action": 0,  # ADD
@@ -187,7 +187,10 @@ class _Maker:
         return self.message(t_ns, topic, "visualization_msgs/MarkerArray", markers=made)
 
     def dots(self, name: str, positions: Mapping[str, Array], colour: Colour) -> list[dict[str, Any]]:
-        """Return the shapes of labelled spheres. ``name``: their namespace. ``positions``: (3,) [m] by label."""
+        """Return fields of ``visualization_msgs/Marker`` for labelled spheres, for :meth:`markers`.
+
+        ``name``: namespace of the markers. ``positions``: the centre (3,) [m] of each sphere by label.
+        """
         places = {label: position.tolist() for label, position in positions.items()}
         labels = [
             self.shape(f"{name}: names", TEXT, LETTERS, colour, [], text=label, at=(x, y, z + DOT))

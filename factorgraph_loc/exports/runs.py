@@ -37,7 +37,7 @@ class _Learnt(FileModel, extra="ignore"):
 
 
 class RunFolder(FileModel, extra="ignore"):
-    """The folder ``path`` of a run, with the log, estimator, sensors and seed in its file ``config.toml``."""
+    """The folder ``path`` of a stored run, with the log, estimator, sensors and seed in its file ``config.toml``."""
 
     path: Path
     log: Annotated[str, Field(min_length=1)]
@@ -48,11 +48,11 @@ class RunFolder(FileModel, extra="ignore"):
 
 @dataclass(frozen=True)
 class StoredRun:
-    """A stored run. Times are in seconds from the start of its log.
+    """The estimates of one stored run of an estimator. Times are in seconds from the start of its log.
 
-    ``causal``: causal estimates since the first localization. ``final``: the trajectory estimated from the whole log.
-    Both may be empty. ``series``: times (K,) and values (K,) by name: ``error_position`` [m], ``error_heading`` [rad],
-    ``nees``. ``landmarks``: estimated landmarks by name. ``events``: times [s] and texts.
+    ``causal``: estimates that use only earlier measurements, since the first localization. ``final``: the trajectory
+    estimated from the whole log. Both may be empty. ``series``: times (K,) and values (K,) by name: ``error_position``
+    [m], ``error_heading`` [rad], ``nees``. ``landmarks``: estimated landmarks by name. ``events``: times [s] and texts.
     """
 
     name: str
@@ -64,7 +64,7 @@ class StoredRun:
     events: tuple[tuple[float, str], ...]
 
     def played(self) -> Trajectory:
-        """Return the trajectory to show over time: the causal one, or the final one if there are no causal estimates."""
+        """Return the trajectory to animate: the causal one, or the final one if there are no causal estimates."""
         return self.causal if len(self.causal) else self.final
 
 
@@ -74,7 +74,10 @@ def is_results(path: Path) -> bool:
 
 
 def find_runs(path: Path) -> list[RunFolder]:
-    """Return the successful runs of a result folder. Raises InputError if there is none."""
+    """Return the folders of the successful runs in a result folder, each with its log, estimator and seed.
+
+    ``path``: the folder of one run, a comparison or an experiment. Raises InputError if it has no results.
+    """
     folders = [path] if (path / COMPLETE).is_file() else _stored(path) if is_results(path) else []
     if not folders:
         raise InputError(f"{path}: contains no results, expected a folder that `fgloc run` or `fgloc compare` wrote")
@@ -93,10 +96,10 @@ def _stored(path: Path) -> list[Path]:
 
 
 def read_runs(folders: Sequence[RunFolder], log: Log) -> list[StoredRun]:
-    """Read the runs on ``log`` in ``folders``.
+    """Return the estimates in the given folders of runs on ``log``.
 
-    The name of a run is its estimator. If such names are not unique, the seed is appended, and also the folder if
-    needed. Raises InputError if a run is not of this log, or if a file is damaged.
+    Each gets a unique name: the estimator, with the seed and the folder appended if needed. Raises InputError if a run
+    is not of this log, or if a file is damaged.
     """
     names = [folder.estimator for folder in folders]
     with_seeds = [f"{folder.estimator}-seed{folder.seed}" for folder in folders]
@@ -133,7 +136,7 @@ def _read(folder: RunFolder, name: str, log: Log) -> StoredRun:
 
 
 def _check_times(run: StoredRun, log: Log) -> None:
-    """Raise InputError if estimates are outside of the time of the log. The run is then of another log with the same name."""
+    """Raise InputError if estimates are outside of the time of ``log``. The run must then be of another log."""
     first, last = log.span()
     for trajectory in (run.causal, run.final):
         if len(trajectory) and (trajectory.t[0] < first - MARGIN or trajectory.t[-1] > last + MARGIN):

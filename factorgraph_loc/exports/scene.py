@@ -22,15 +22,15 @@ REFERENCE, DARK, DETECTION, SIGHTING = (128, 128, 128), (160, 160, 160), (230, 1
 
 @dataclass(frozen=True)
 class Lights:
-    """The objects of a map that are highlighted over time. ``names[i]``: names of all objects that are highlighted from
-    ``t[i]`` to ``t[i + 1]`` [s]."""
+    """Lists which objects of a map are highlighted at which time. ``names[i]``: names of all objects that are
+    highlighted from ``t[i]`` to ``t[i + 1]`` [s]."""
 
     t: Array
     names: tuple[tuple[str, ...], ...]
 
 
 def colours() -> Iterator[Colour]:
-    """Yield the colours of plots, one for each run. After the last colour they repeat."""
+    """Yield distinct colours of plots as (red, green, blue) from 0 to 255, repeating after the last colour."""
     # without the last colour, black, because the background of viewers is black
     for colour in itertools.cycle(drawing_figures.COLOURS[:-1]):
         red, green, blue = bytes.fromhex(colour[1:])
@@ -38,9 +38,10 @@ def colours() -> Iterator[Colour]:
 
 
 def layers(log: Log) -> list[tuple[Marks, dict[str, Array], Lights]]:
-    """Return the mapped objects of each sensor, the position (3,) [m] of each by name, and when each is highlighted.
+    """Return (objects, positions, highlights) for each kind of mapped object, such as landmarks.
 
-    An object is highlighted for :data:`LIT_FOR` seconds after each observation.
+    The positions are arrays (3,) [m] by name. An object is highlighted for :data:`LIT_FOR` seconds after each
+    observation.
     """
     drawn = sorted(marks(log), key=lambda layer: layer.order)
     return [
@@ -79,6 +80,6 @@ def _lights(t: Iterable[float], names: Sequence[str]) -> Lights:
 
 
 def segments(trajectory: Trajectory) -> list[Array]:
-    """Return the parts of a trajectory between gaps longer than :data:`GAP`, each as positions (K, 2) [m]."""
+    """Return the positions (K, 2) [m] of each part of a trajectory. It is split at gaps longer than :data:`GAP`."""
     breaks = [0, *(np.flatnonzero(np.diff(trajectory.t) > GAP) + 1).tolist(), len(trajectory)]
     return [trajectory.poses[i:j, :2] for i, j in itertools.pairwise(breaks) if j - i > 1]

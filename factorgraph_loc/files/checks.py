@@ -144,7 +144,7 @@ def last_in_order(
 def stamps(source: object, rows: Integers, t: Array) -> Integers:
     """Return the timestamps ``t`` (N,) [s] in nanoseconds. Raises InputError at the first that is out of range.
 
-    ``rows`` (N,): row numbers in the file ``source``, for the error.
+    ``rows`` (N,): row numbers in the file ``source``, which the error names.
     """
     SECONDS.require(source, rows, t, "time")
     return np.asarray(np.rint(t * 1e9).astype(np.int64))

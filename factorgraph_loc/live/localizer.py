@@ -146,7 +146,8 @@ class Localizer:
             return self._estimate(t)
 
     def belief(self) -> Belief:
-        """Return the belief at the newest timestamp: Gaussian modes, and particles if the estimator uses them.
+        """Return the distribution of the pose at the newest timestamp: Gaussian modes, and particles if the estimator
+        has them.
 
         Before the start it has no modes. Raises RunFailedError as :meth:`estimate` does.
         """
@@ -158,7 +159,7 @@ class Localizer:
                 return copy.deepcopy(self._frame.belief(sound_belief(self._estimator.belief(self._newest))))
 
     def trajectory(self) -> Trajectory:
-        """Return the smoothed trajectory at 10 Hz, of at least the last ``history`` seconds before the newest timestamp."""
+        """Return the smoothed poses at 10 Hz, for at least the last ``history`` seconds before the newest timestamp."""
         with self._lock:
             self._require_whole()
             if self._estimator is None or self._ticks is None or not self._ticks.count:
@@ -167,7 +168,7 @@ class Localizer:
                 return copy.deepcopy(self._frame.trajectory(sound_trajectory(self._estimator.trajectory())))
 
     def learnt(self) -> Learnt:
-        """Return smoothed estimates other than poses: constants of sensors, landmarks and points."""
+        """Return smoothed estimates other than poses: calibration constants of sensors, landmarks and map points."""
         with self._lock:
             self._require_whole()
             if self._estimator is None:
@@ -176,7 +177,10 @@ class Localizer:
                 return copy.deepcopy(self._estimator.learnt())
 
     def diagnostics(self) -> Diagnostics:
-        """Return the counts of ignored, rejected and late measurements since the start, and recent innovations and events."""
+        """Return the counts of ignored, rejected and late measurements since the start, and recent statistics.
+
+        The statistics are residuals and normalised innovations by sensor, and events such as a rebuilt graph.
+        """
         with self._lock:
             return Diagnostics() if self._estimator is None else copy.deepcopy(self._estimator.diagnostics)
 
@@ -294,7 +298,7 @@ RATIO = 1e14  # largest ratio of eigenvalues of a covariance, because a double h
 
 
 def require_options(rig: object, world: object, settings: object, history: object, seed: object) -> None:
-    """Raise InputError if an argument of :class:`Localizer` is invalid."""
+    """Raise InputError if an argument has a type or value that :class:`Localizer` does not accept."""
     for name, value, kind in (
         ("rig", rig, Rig),
         ("world", world, World | None),
@@ -311,7 +315,7 @@ def require_options(rig: object, world: object, settings: object, history: objec
 
 
 def usable_sensors(rig: Rig, asked: Sequence[str] | None) -> tuple[str, ...]:
-    """Return the sensors among ``asked`` that the rig describes. None stands for all sensors of the rig.
+    """Return the names of the sensors in ``asked`` that the rig has settings of. None: all sensors of the rig.
 
     Raises InputError if a sensor is unknown.
     """

@@ -107,7 +107,7 @@ def checked_rotations(source: str, rows: Integers, table: Array) -> Array:
     """Return the rotations (N, 3, 3) of a ``table`` (N, 7) of positions x, y, z and quaternions x, y, z, w.
 
     Raises InputError if a number is not finite or a quaternion is not a unit quaternion. ``rows`` (N,): row numbers in
-    ``source``, for the message.
+    ``source``, which the error names.
     """
     checks.require_finite(source, rows, SEVEN, table)
     return rotations_of(source, rows, table[:, 3:])
