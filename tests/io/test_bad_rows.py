@@ -136,7 +136,9 @@ def test_rounds_that_reads_name_by_number(native, refused):
     (native / "inventories.csv").write_text("t_ns,antenna,duration\n1,l,x\n1200000000,l,0.1\n1400000000,l,0.1\n")
     (native / "rfid.csv").write_text("t_ns,antenna,epc,inventory\n1150000000,l,E1,2\n")
     (native / "run.toml").write_text(SKIP + (native / "run.toml").read_text())
-    refused(native, "inventories.csv: some rows were skipped or sorted, but the reads refer to these rows by row number")
+    refused(
+        native, "inventories.csv: some rows were skipped or sorted, but the reads refer to these rows by row number"
+    )
 
 
 def test_messages_are_skipped_and_sorted(maker, read_drive):
