@@ -45,13 +45,12 @@ _IDEAL: dict[str, Any] = {"color": "black", "linewidth": 1.0, "label": "ideal"}
 
 @dataclass(frozen=True)
 class Track:
-    """The plotted data of one run.
+    """The data of one run of an estimator that are plotted.
 
     ``causal``: poses that were estimated online, None if the robot was never localized. ``final``: poses after all
-    measurements, which may be empty.
-    ``nis``: by sensor, rows (K, 3) of time [s], normalised innovation squared, and degrees of freedom.
-    ``events``: time [s] and description of each event. ``max_gap`` [s]: errors are not interpolated across longer gaps.
-    ``reliability``: by sensor, the observed and the predicted numbers of detections.
+    measurements, which may be empty. ``nis``: by sensor, rows (K, 3) of time [s], normalised innovation squared, and
+    degrees of freedom. ``events``: time [s] and description of each event. ``max_gap`` [s]: errors are not interpolated
+    across longer gaps. ``reliability``: by sensor, the observed and the predicted numbers of detections.
     """
 
     causal: Trajectory | None
@@ -70,7 +69,7 @@ class Track:
 
     @classmethod
     def read(cls, files: ResultFiles, max_gap: float = MAX_GAP) -> Track:
-        """Read the plotted data of a run from its result files. ``reliability`` is empty, because no file contains it.
+        """Return the plotted data of a run from its result files. ``reliability`` is empty: no file contains it.
 
         ``max_gap`` [s]: errors are not interpolated across longer gaps between estimates.
         """
@@ -78,7 +77,7 @@ class Track:
         return cls(causal if len(causal) else None, final, files.innovations(), files.events(), max_gap)
 
     def kinds(self) -> tuple[tuple[str, Trajectory | None], tuple[str, Trajectory | None]]:
-        """Return the names and trajectories of the causal and the final estimates; None for a trajectory without poses."""
+        """Return ("causal", its trajectory) and ("final", its trajectory). A trajectory without poses is None."""
         return ("causal", self.causal), ("final", self.final if len(self.final) else None)
 
 
@@ -88,14 +87,14 @@ def write_picture(figure: Figure, path: Path) -> None:
 
 
 def mark_events(axis: Axes, events: Sequence[tuple[float, str]]) -> None:
-    """Mark events, given as time [s] and description, by dashed vertical lines."""
+    """Mark the times of ``events``, pairs of a time [s] and a description, by dashed vertical lines."""
     for i, (t, _) in enumerate(events):
         label = "event (see events.csv)" if i == 0 else None
         axis.axvline(t, color=COLOURS[3], linestyle="--", linewidth=1.0, label=label, zorder=1.5)
 
 
 def with_pauses(t: Array, values: Array) -> tuple[Array, Array]:
-    """Insert a row of NaN into times (N,) and values (N, ...) in each long gap, and return both. Plotted lines end there."""
+    """Return times (N,) and values (N, ...) with a row of NaN in each long gap of ``t``, which ends a plotted line."""
     breaks = pauses(t)
     return np.insert(t, breaks, np.nan), np.insert(values, breaks, np.nan, axis=0)
 
@@ -106,7 +105,7 @@ def gapped_path(trajectory: Trajectory) -> Array:
 
 
 def consistency(log: Log, estimator: str, track: Track) -> Figure | None:
-    """Plot the NEES of the causal and final poses, and the NIS per degree of freedom of each sensor, over time.
+    """Return a figure of the NEES of the causal and final poses, and of the NIS per degree of freedom of each sensor.
 
     The NEES is plotted only if the log has a reference. Returns None if there is neither NEES nor NIS.
     """
@@ -137,10 +136,10 @@ def consistency(log: Log, estimator: str, track: Track) -> Figure | None:
 
 
 def running_mean(t: Array, values: Array, weights: Array) -> tuple[Array, Array]:
-    """Return the running means (N,) in windows of :data:`WINDOW` seconds around each time, and the sums of weights (N,) in them.
+    """Return weighted means (N,) in windows of :data:`WINDOW` seconds around each time, and the sums of weights (N,).
 
     ``t`` (N,): ascending times [s]. ``values`` (N,): values that are already multiplied by their ``weights`` (N,). The
-    mean is NaN if the sum of weights is 0.
+    mean is NaN if the sum of weights in a window is 0.
     """
     first = np.searchsorted(t, t - WINDOW / 2.0, side="left")
     last = np.searchsorted(t, t + WINDOW / 2.0, side="right")
@@ -182,7 +181,8 @@ def _nis(axis: Axes, sensor: str, rows: Array) -> None:
 
 
 def _draw(axis: Axes, t: Array, single: Array, mean: tuple[Array, Array], low: float) -> None:
-    """Draw single values (N,) and their running ``mean`` (times, values). The y axis starts at ``low`` / 4."""
+    """Draw ``single`` values (N,) at the times ``t`` (N,), and their running ``mean`` (times, values). The y axis
+    starts at ``low`` / 4."""
     axis.plot(t, single, ".", color="0.6", markersize=2.5, label="single values", zorder=2)
     axis.plot(*mean, color=COLOURS[1], linewidth=2.0, label=f"mean over {WINDOW:g} s", zorder=3)
     # the smallest values are not in the range of the axis

@@ -46,9 +46,9 @@ Units = Literal["logs", "seeds"]
 class Pooled:
     """A score of a method, pooled over the seeds and logs of many runs.
 
-    ``low``, ``high``: 95 % interval of ``value``, None if there are too few units. ``units``: "logs" are the
-    independent units, or "seeds" for a single log. ``least``, ``most``: smallest and largest score of a unit.
-    ``count``, ``logs``: numbers of units and logs.
+    ``low``, ``high``: 95 % interval of ``value``, None if there are too few units. ``units``: the independent samples
+    of the statistics. They are "logs", or "seeds" for a single log. ``least``, ``most``: smallest and largest score of
+    a unit. ``count``, ``logs``: numbers of units and logs.
     """
 
     value: float
@@ -66,11 +66,10 @@ class Contrast:
     """The difference between the scores of two methods a and b.
 
     ``difference``: pooled score of a minus that of b. ``low``, ``high``: its 95 % interval. ``p``: two-sided p value of
-    the signed-rank test. ``effect``: rank-biserial correlation, -1 to 1. Interval, ``p`` and ``effect`` may be None
-    (too few units).
-    ``units``: "logs" are the independent units, or "seeds" if there is a single log. ``count``: number of units.
-    ``by_log``: by log, the scores of a and of b. ``pairs``: number of compared pairs of runs. ``left_out``: number of
-    runs without a run of the other method on the same log and seed.
+    the signed-rank test. ``effect``: rank-biserial correlation, -1 to 1. Interval, ``p`` and ``effect`` are None if
+    there are too few units. ``units``: the independent samples of the statistics, "logs", or "seeds" for a single log.
+    ``count``: number of units. ``by_log``: by log, the scores of a and of b. ``pairs``: number of compared pairs of
+    runs. ``left_out``: number of runs without a run of the other method on the same log and seed.
     """
 
     difference: float
@@ -86,7 +85,7 @@ class Contrast:
 
 
 def pooled(scores: ByLog, *, rms: bool, alike: Mapping[str, str] | None = None) -> Pooled | None:
-    """Pool a score over seeds, and then over logs with equal weights. Return None if there are no scores.
+    """Return a score that is pooled over seeds, and then over logs with equal weights. Return None without scores.
 
     ``scores``: {log: {seed: score}}. ``rms``: whether to pool by the root mean square instead of the mean. ``alike``:
     {log: name of its group}. All logs of a group count as one log.
@@ -106,10 +105,11 @@ def pooled(scores: ByLog, *, rms: bool, alike: Mapping[str, str] | None = None) 
 def contrast(
     a: ByLog, b: ByLog, *, rms: bool, interval: bool = True, alike: Mapping[str, str] | None = None
 ) -> Contrast | None:
-    """Compare the scores ``a`` and ``b`` of two methods on common logs and seeds. Return None without common runs.
+    """Return the difference between the scores ``a`` and ``b`` of two methods, {log: {seed: score}}.
 
-    If a method ran with a single seed, its run is paired with each seed of the other method. ``rms``, ``alike``: see
-    :func:`pooled`. ``interval``: whether to compute the interval, which takes time.
+    Only common logs and seeds are compared. If a method ran with a single seed, its run is paired with each seed of the
+    other method. ``rms``, ``alike``: see :func:`pooled`. ``interval``: whether to compute the interval, which takes
+    time. Returns None without common runs.
     """
     matched = {log: pair_seeds(a[log], b[log]) for log in a if log in b}
     left_out = sum(missing for _, missing in matched.values()) + sum(len(b[log]) for log in b if log not in a)
@@ -144,13 +144,12 @@ def contrast(
 
 
 def differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Return the rows of a table of differences between the RMSEs of all pairs of estimators ``a`` and ``b``.
+    """Return a table of the differences between the RMSEs of all pairs of estimators ``a`` and ``b`` on each log.
 
-    ``rows``: runs with log, estimator, seed and scores. A row of the result is about one log. It has the columns
+    ``rows``: runs as dictionaries with log, estimator, seed and scores. A row of the result has the keys
     :data:`DIFFERENCES`. ``value_a``, ``value_b``: RMSEs over pairs of seeds, None without pairs. ``difference``: a
     minus b. ``pairs``: number of compared pairs of runs. ``left_out``: number of runs without a run of the other
-    estimator.
-    If there are enough logs, a row with log "(all)" has the interval ``low``, ``high`` of the difference.
+    estimator. If there are enough logs, a row with the log "(all)" has a 95 % interval ``low``, ``high``.
     """
     logs = list(dict.fromkeys(row["log"] for row in rows))
     names = list(dict.fromkeys(row["estimator"] for row in rows))
@@ -201,14 +200,14 @@ def signed_rank(differences: Array) -> float:
 
 
 def rank_biserial(differences: Array) -> float:
-    """Return the matched-pairs rank-biserial correlation of differences (N,): 1 if all are positive, -1 if all are negative."""
+    """Return the matched-pairs rank-biserial correlation of ``differences`` (N,): 1 if all are above 0, -1 if below."""
     ranks = _ranks(differences)
     total = float(ranks[differences != 0.0].sum())
     return float(ranks[differences > 0.0].sum() - ranks[differences < 0.0].sum()) / total if total else 0.0
 
 
 def holm(p_values: Sequence[float | None]) -> list[float | None]:
-    """Return ``p_values`` corrected for the number of tests by Holm's method. None stands for a test that was not made."""
+    """Return ``p_values`` corrected for the number of tests by Holm's method. None means that a test was not made."""
     tested = sorted((p, i) for i, p in enumerate(p_values) if p is not None)
     corrected: list[float | None] = [None] * len(p_values)
     largest = 0.0
@@ -224,9 +223,10 @@ def least_p(count: int) -> float:
 
 
 def independent_count(values: Array) -> float:
-    """Return the effective number of independent values in a time series (N,): N divided by its autocorrelation time, at least 1.
+    """Return the effective number of independent values in a time series (N,): N divided by the autocorrelation time.
 
-    Autocorrelations are summed over pairs of lags until the sum of a pair is not positive (Geyer's initial positive sequence).
+    It is at least 1. Autocorrelations are summed over pairs of lags until the sum of a pair is not positive (Geyer's
+    initial positive sequence).
     """
     n = len(values)
     centred = values - np.mean(values)
@@ -242,10 +242,10 @@ def independent_count(values: Array) -> float:
 
 
 def mean_nees_band(counts: Sequence[float], dofs: Sequence[int]) -> tuple[float, float]:
-    """Return the 95 % interval of the mean NEES of a consistent estimator. The mean is over each log, and then over the logs.
+    """Return the 95 % interval of the mean NEES of a consistent estimator, averaged over each log and then over logs.
 
-    ``counts``: by log, the effective number of independent values. ``dofs``: by log, the degrees of freedom of a pose. The
-    distribution is approximated by a scaled chi-square distribution with the same mean and variance.
+    ``counts``: by log, the effective number of independent values. ``dofs``: by log, the degrees of freedom of a pose.
+    The distribution is approximated by a scaled chi-square distribution with the same mean and variance.
     """
     expected = float(np.mean(dofs))
     matched = (expected * len(dofs)) ** 2 / float(np.sum(np.asarray(dofs) / np.asarray(counts, dtype=float)))
@@ -255,15 +255,15 @@ def mean_nees_band(counts: Sequence[float], dofs: Sequence[int]) -> tuple[float,
 
 
 def _ranks(differences: Array) -> Array:
-    """Return the ranks (N,) of the absolute values of ``differences`` (N,), like ``scipy.stats.rankdata``, but without
-    the slow import of ``scipy.stats``."""
+    """Return the ranks (N,) of the absolute values of ``differences`` (N,). Equal values have their mean rank. This
+    avoids the slow import of ``scipy.stats.rankdata``."""
     _, which, counts = np.unique(np.abs(differences), return_inverse=True, return_counts=True)
     return np.asarray((np.cumsum(counts) - 0.5 * (counts - 1.0))[which])
 
 
 def _clusters(scores: Mapping[str, Array], alike: Mapping[str, str] | None) -> list[Array]:
-    """Return an array (K, C) for each log with scores: C scores of K runs. Logs of one group in ``alike`` share an
-    array."""
+    """Return an array (K, C) for each log with scores: C scores of K runs. ``alike``: {log: name of its group}, or
+    None. Logs of one group share an array."""
     merged: dict[str, list[Array]] = {}
     for log, values in scores.items():
         if len(values):
@@ -272,7 +272,8 @@ def _clusters(scores: Mapping[str, Array], alike: Mapping[str, str] | None) -> l
 
 
 def _units(clusters: Sequence[Array]) -> tuple[Units, bool]:
-    """Return the independent units, "logs", or "seeds" for a single log, and True if there are enough for intervals."""
+    """Return the kind of independent units, "logs", or "seeds" for a single log. Also return True if there are enough
+    units for intervals. ``clusters``: the scores (K, C) of the runs on each log."""
     if len(clusters) == 1:
         return "seeds", len(clusters[0]) >= ENOUGH_LOGS
     return "logs", len(clusters) >= ENOUGH_LOGS

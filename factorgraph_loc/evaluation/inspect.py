@@ -19,7 +19,7 @@ from factors.se2 import Array
 class StreamSummary:
     """Summary of a stream: the number of rows, the median ``rate`` [Hz], the ``first`` and ``last`` timestamp [s].
 
-    ``gaps``: start and length [s] of each long gap.
+    ``gaps``: start and length [s] of each interval between timestamps that is much longer than usual.
     """
 
     rows: int
@@ -31,10 +31,10 @@ class StreamSummary:
 
 @dataclass(frozen=True)
 class Inspection:
-    """The result of an inspection.
+    """A summary of the content of a log.
 
-    ``streams``: by name, a summary of each stream. ``reference``: summary of the reference, None if the log has none.
-    ``problems``: warnings. ``sensors``: by sensor, a summary of its measurements.
+    ``streams``: by name, a summary of each stream. ``reference``: summary of the reference trajectory, None if the log
+    has none. ``problems``: warnings. ``sensors``: by sensor, a summary of its measurements.
     """
 
     streams: Mapping[str, StreamSummary]
@@ -44,8 +44,8 @@ class Inspection:
 
     @property
     def found(self) -> dict[str, Any]:
-        """The entries of all sensor summaries by key, such as ``unseen`` or ``rfid``. If a kind has several sensors,
-        the key is the name of a sensor, and the value a dictionary of its entries."""
+        """The statistics of all sensors by key, such as ``unseen`` or ``rfid``. If a kind has several sensors, the key
+        is the name of a sensor, and the value is a dictionary of its statistics."""
         entries: dict[str, Any] = {}
         for name, summary in self.sensors.items():
             entries |= summary.found if kind_of(name) == name else {name: dict(summary.found)}
@@ -58,7 +58,7 @@ class Inspection:
 
 
 def inspect(log: Log) -> Inspection:
-    """Summarize the streams of a log, and collect warnings about problems."""
+    """Return a summary of the streams and sensors of a log, with warnings about problems."""
     streams = {name: _summary(stream.t) for name, stream in log.streams.items()}
     reference = None if log.reference is None else _summary(log.reference.t)
     problems = list(log.warnings)
@@ -84,14 +84,15 @@ def _with_sensor_name(name: str, summary: Summary) -> Summary:
 
 
 def _problems(name: str, sensors: Mapping[str, Summary]) -> list[Notice]:
-    """Return the warnings of a sensor. A landmark or tag is reported as undetected only if no sensor of the kind detects it."""
+    """Return the warnings of the sensor ``name``. ``sensors``: by sensor, its summary. A landmark or tag is reported as
+    undetected only if no sensor of the kind detects it."""
     of_kind = [summary for each, summary in sensors.items() if kind_of(each) == kind_of(name)]
     undetected = [each for each in sensors[name].undetected if all(each in summary.undetected for summary in of_kind)]
     return [*sensors[name].problems, *undetected]
 
 
 def _summary(t: Array) -> StreamSummary:
-    """Summarize a stream. ``t`` (N,): timestamps [s] in the order of the rows."""
+    """Return a summary of a stream. ``t`` (N,): timestamps [s] in the order of the rows."""
     if len(t) == 0:
         return StreamSummary(0, 0.0, 0.0, 0.0, ())
     stamps = np.unique(t)

@@ -60,10 +60,10 @@ class Errors:
 
 
 def errors(trajectory: Trajectory, reference: Trajectory, max_gap: float = MAX_GAP) -> Errors:
-    """Return the errors of a trajectory against the reference, without alignment, at about ten times per second.
+    """Return the errors of a trajectory against the reference, without alignment.
 
-    ``max_gap`` [s]: errors are NaN between estimates that are further apart. See
-    :func:`~factorgraph_loc.evaluation.pairing.pairs`.
+    The errors are at timestamps of the reference that are at least 0.1 s apart. ``max_gap`` [s]: errors are NaN between
+    estimates that are further apart. See :func:`~factorgraph_loc.evaluation.pairing.pairs`.
     """
     if trajectory.covariances is not None:
         unsound = ~_positive_definite(trajectory.covariances)
@@ -99,19 +99,21 @@ def errors(trajectory: Trajectory, reference: Trajectory, max_gap: float = MAX_G
 def score(result: RunResult, log: Log, align: Alignment = "none") -> dict[str, Any]:
     """Return all scores of a run by key, in metres and radians. A score that is undefined is None.
 
-    - ``scoring.max_gap`` [s]: the maximum gap across which estimates are interpolated. Compare only runs with equal values.
-    - ``causal.*``, ``final.*``: scores of the online and of the final trajectory, see :func:`accuracy`. They begin when the
-      robot is first localized. Without a reference, or with fewer than :data:`FEWEST_SCORED` poses, all but ``scored`` are
-      None.
+    - ``scoring.max_gap`` [s]: the maximum gap across which estimates are interpolated. Compare only runs with equal
+      values.
+    - ``causal.*``, ``final.*``: scores of the online and of the final trajectory, see :func:`accuracy`. They begin when
+      the robot is first localized. Without a reference, or with fewer than :data:`FEWEST_SCORED` poses, all but
+      ``scored`` are None.
     - ``time_to_localized`` [s]: time from the start of the run until the robot is localized.
     - ``landmarks.*``: see :func:`landmark_figures`; None unless the run estimated the map.
-    - ``learnt.NAME.value`` and ``learnt.NAME.sigma``: value and standard deviation of each learnt constant.
+    - ``learnt.NAME.value`` and ``learnt.NAME.sigma``: value and standard deviation of each estimated constant, such as
+      a wheel scale.
     - ``nis.SENSOR.*``, ``ignored.*``, ``rejected.*``, ``late.*``, ``timing.*``, and the list ``warnings`` always exist.
 
-    ``align``: how to align the trajectories with the reference. If the run estimated its map, "none" becomes "se2". With an
-    alignment there are also ``scoring.align``, and the errors :data:`ALIGNED` [m, rad] after the alignment, by
-    :func:`~factorgraph_loc.evaluation.trajectories.score.score_paths`. If the poses do not determine the alignment, these
-    errors are None and there is a warning.
+    ``align``: how to align the trajectories with the reference. If the run estimated its map, "none" becomes "se2".
+    With an alignment there are also ``scoring.align``, and the errors :data:`ALIGNED` [m, rad] after the alignment, by
+    :func:`~factorgraph_loc.evaluation.trajectories.score.score_paths`. If the poses do not determine the alignment,
+    these errors are None and there is a warning.
     """
     causal = result.causal()
     final = result.final
@@ -153,17 +155,19 @@ def _aligned(trajectory: Trajectory | None, log: Log, align: Alignment, max_gap:
 
 
 def accuracy(trajectory: Trajectory, reference: Trajectory | None, max_gap: float = MAX_GAP) -> dict[str, Any]:
-    """Return the scores of one trajectory against the reference by name. All are None if there is no reference. ``max_gap``
-    [s]: see :func:`errors`.
+    """Return the scores of one trajectory against the reference, by name. All are None if there is no reference.
+    ``max_gap`` [s]: see :func:`errors`.
 
-    - ``position_*`` [m], ``heading_*`` [rad]: ``rmse``, ``median``, ``p95`` and ``max`` of the errors, see :func:`errors`.
-    - ``rpe_position_per_m``, ``rpe_heading_per_m``: root mean square of the relative errors over pieces of one metre of path,
-      see :func:`~factorgraph_loc.evaluation.trajectories.score.pose_errors`. ``rpe_pieces``: number of these pieces.
+    - ``position_*`` [m], ``heading_*`` [rad]: ``rmse``, ``median``, ``p95`` and ``max`` of the errors, see
+      :func:`errors`.
+    - ``rpe_position_per_m``, ``rpe_heading_per_m``: root mean square of the relative errors over pieces of one metre of
+      path, see :func:`~factorgraph_loc.evaluation.trajectories.score.pose_errors`. ``rpe_pieces``: number of these
+      pieces.
     - ``rpe_position_per_s``, ``rpe_heading_per_s``: root mean square of the relative errors over pieces of one second.
     - ``anees``: mean NEES, ideally 3, or 2 if the reference has no heading.
-    - ``nees_bounds``: 95 % interval of the ANEES of a consistent estimator with independent errors. Errors along a trajectory
-      are correlated, so a consistent estimator is outside of the interval in more than 5 % of runs.
-    - ``coverage_95``: fraction of the times at which the true (x, y) lies in the 95 % ellipse.
+    - ``nees_bounds``: 95 % interval of the ANEES of a consistent estimator with independent errors. Errors along a
+      trajectory are correlated, so a consistent estimator is outside of the interval in more than 5 % of runs.
+    - ``coverage_95``: fraction of the times at which the true (x, y) lies in the 95 % ellipse of the estimate.
     - ``invalid_covariances``: number of scored poses with a covariance that is not positive definite. ``anees``,
       ``nees_bounds`` and ``coverage_95`` exclude them.
     - ``scored``: number of compared poses.
@@ -204,8 +208,8 @@ def landmark_figures(
     ``trajectory`` with the reference. Without a reference, the landmarks themselves are aligned with the map.
     ``max_gap`` [s]: see :func:`errors`.
 
-    - ``landmarks.count``: number of estimated landmarks that the log's map has too.
-    - ``landmarks.rmse`` [m]: root mean square distance of these landmarks from the map.
+    - ``landmarks.count``: number of estimated landmarks that are also in the map of the log.
+    - ``landmarks.rmse`` [m]: root mean square distance of these landmarks from their positions in the map.
     - ``landmarks.anees``: mean NEES of these landmarks, ideally 2. It is usually below 2, because the covariances
       include the uncertainty of the start, which the alignment removes.
     """
@@ -237,7 +241,7 @@ def _positive_definite(covariances: Array) -> NDArray[np.bool_]:
 
 
 def _squared(difference: Array, covariances: Array) -> Array:
-    """Return the squared Mahalanobis distances (N,) of differences (N, D) with ``covariances`` (N, D, D)."""
+    """Return the squared Mahalanobis distances (N,) of ``difference`` (N, D) with ``covariances`` (N, D, D)."""
     whitened = positive.solve(covariances, difference[..., None])[..., 0]
     return np.asarray(np.sum(difference * whitened, axis=1))
 

@@ -44,8 +44,8 @@ class Pairs:
 
 
 def thinned(t: Array) -> Integers:
-    """Return the indices of the ascending timestamps ``t`` (N,) [s] at which poses are scored. The first one is
-    selected, and then each one that is at least 0.1 s after the last selected one."""
+    """Return the indices of the timestamps ``t`` (N,) [s], ascending, that are selected for scoring poses. The first
+    timestamp is selected, and then each one at least 0.1 s after the last selected one."""
     kept: list[int] = []
     stamps, i = t.tolist(), 0
     while i < len(stamps):
@@ -55,7 +55,7 @@ def thinned(t: Array) -> Integers:
 
 
 def pairs(trajectory: Trajectory, reference: Trajectory, max_gap: float = MAX_GAP) -> Pairs:
-    """Interpolate a trajectory at timestamps of the reference, and pair it with the reference.
+    """Return the poses of a trajectory, interpolated at timestamps of the reference, and the poses of the reference.
 
     ``max_gap`` [s]: the interpolated pose is NaN between estimates that are further apart.
     """
@@ -67,7 +67,7 @@ def pairs(trajectory: Trajectory, reference: Trajectory, max_gap: float = MAX_GA
 
 
 def pairs_in_space(estimate: PosePath, reference: PosePath, max_gap: float = MAX_GAP) -> tuple[PosePath, PosePath]:
-    """Interpolate a path in space at timestamps of the reference. Return the interpolated and the true poses, in equal numbers.
+    """Return M poses of ``estimate``, interpolated at timestamps of the reference, and the M poses of the reference.
 
     ``max_gap`` [s]: timestamps between estimates that are further apart are omitted.
     """
@@ -122,10 +122,10 @@ def summarize(values: Array) -> dict[str, float | None]:
 
 
 def successive(steps: Array, length: float, first: int = 0) -> list[tuple[int, int]]:
-    """Divide a path of N poses into successive pieces. Return the indices of the first and the last pose of each piece.
+    """Return the first and the last pose of successive pieces of a path of N poses, as pairs of indices.
 
-    ``steps`` (N - 1,): distances or times between successive poses. ``first``: index of the first pose. A piece ends at
-    the first pose where the sum of its steps is ``length`` or more.
+    ``steps`` (N - 1,): distances or times between successive poses. A piece ends at the first pose where the sum of its
+    steps is ``length`` or more. ``first``: number that is added to all indices.
     """
     pieces: list[tuple[int, int]] = []
     begin, covered = first, 0.0
@@ -138,10 +138,10 @@ def successive(steps: Array, length: float, first: int = 0) -> list[tuple[int, i
 
 
 def all_pairs(steps: Array, length: float, first: int = 0) -> list[tuple[int, int]]:
-    """Return overlapping pieces of a path of N poses, one from each pose, as indices of their first and last pose.
+    """Return the first and the last pose of overlapping pieces of a path of N poses, as pairs of indices.
 
-    ``steps``, ``first``: see :func:`successive`. The length of a piece is as near to ``length`` as possible. A piece is
-    omitted if its length deviates by more than :data:`PIECE_TOLERANCE` times ``length``.
+    A piece begins at each pose. Its length is as near to ``length`` as possible. A piece is omitted if its length
+    deviates by more than :data:`PIECE_TOLERANCE` times ``length``. ``steps``, ``first``: see :func:`successive`.
     """
     covered = np.concatenate(([0.0], np.cumsum(steps))).tolist()
     pieces: list[tuple[int, int]] = []

@@ -68,7 +68,7 @@ def remove_plots(folder: Path) -> None:
 
 
 def _estimator_figures(log: Log, estimator: str, track: Track) -> dict[str, Figure]:
-    """Return the plots of a single estimator by the ending of their file names, such as "errors-ekf"."""
+    """Return the plots of a single estimator as {end of the file name, such as "errors-ekf": figure}."""
     if not len(track.final):
         return {}
     figures = {}
@@ -83,7 +83,8 @@ def _estimator_figures(log: Log, estimator: str, track: Track) -> dict[str, Figu
 
 
 def trajectories(log: Log, tracks: Mapping[str, Track]) -> Figure:
-    """Plot causal and final trajectories with walls, map objects and reference. The range of the axes fits map and reference."""
+    """Return a figure of causal and final trajectories with walls, map objects and reference. ``tracks``: by estimator,
+    the data of its run. The range of the axes fits map and reference."""
     view, height = _plotted_area(log)
     figure, axes = grid(1, 2, height, f"{log.name}: trajectories")
     for i, axis in enumerate(axes[0]):
@@ -99,7 +100,8 @@ def trajectories(log: Log, tracks: Mapping[str, Track]) -> Figure:
 
 
 def overview(log: Log, odometry: Trajectory | None) -> Figure:
-    """Plot a log from above: its map, its reference, and ``odometry``, the dead reckoning from the start (None if unknown)."""
+    """Return a figure of a log from above: its map, its reference, and the dead reckoning from the start (``odometry``,
+    None if it is unknown)."""
     view, height = _plotted_area(log)
     figure, axes = grid(1, 1, height, log.name)
     _map(axes[0, 0], log, view)
@@ -111,7 +113,7 @@ def overview(log: Log, odometry: Trajectory | None) -> Figure:
 
 
 def reliability_diagram(log: Log, estimator: str, reliability: Mapping[str, Reliability]) -> Figure:
-    """Plot the ratio of observed to predicted numbers of detections, with bars of two standard deviations.
+    """Return a figure of the ratio of observed to predicted numbers of detections, with 2-sigma bars.
 
     ``reliability``: by sensor, the numbers of detections in groups of measurements, such as ranges of distance.
     """
@@ -144,7 +146,7 @@ def reliability_diagram(log: Log, estimator: str, reliability: Mapping[str, Reli
 
 
 def error_bands(log: Log, reference: Trajectory, estimator: str, track: Track) -> Figure:
-    """Plot signed errors in x, y and heading over time, of causal and final poses, with bands of two standard deviations."""
+    """Return a figure of signed errors in x, y and heading over time, of causal and final poses, with 2-sigma bands."""
     rows = (("x", "m"), ("y", "m"), ("heading", "rad"))[: 3 if reference.has_heading else 2]
     figure, axes = grid(
         len(rows), 2, 3.0 * len(rows), f"{log.name}, {estimator}: errors, with 2-sigma bands", shared=True
@@ -173,9 +175,9 @@ def error_bands(log: Log, reference: Trajectory, estimator: str, track: Track) -
 
 
 def error_distribution(log: Log, reference: Trajectory, tracks: Mapping[str, Track]) -> Figure:
-    """Plot the cumulative distribution of position and heading errors of causal and final poses, on a logarithmic axis.
+    """Return a figure of the cumulative distributions of position and heading errors of causal and final poses.
 
-    ``tracks``: the plotted data of the run of each estimator by name.
+    ``tracks``: by estimator, the data of its run. The axis of errors is logarithmic.
     """
     rows = (("position", "m"), ("heading", "rad"))[: 2 if reference.has_heading else 1]
     figure, axes = grid(len(rows), 2, 4.5 * len(rows), f"{log.name}: distribution of errors")
@@ -196,7 +198,7 @@ def error_distribution(log: Log, reference: Trajectory, tracks: Mapping[str, Tra
 
 
 def _map(axis: Axes, log: Log, view: Array | None) -> None:
-    """Draw walls, map objects and reference. ``view`` (2, 2) [m]: lower and upper corner of the axes, None to fit the content."""
+    """Draw walls, map objects and reference. ``view`` (2, 2) [m]: lower and upper corner of the axes, None for all."""
     if log.reference is not None:
         axis.plot(*gapped_path(log.reference).T, color="0.75", linewidth=4.0, label="reference", zorder=1)
     walls = np.array(log.world.walls).reshape(-1, 2, 2)
@@ -218,7 +220,7 @@ def _layers(log: Log) -> list[Marks]:
 
 
 def _plotted_area(log: Log) -> tuple[Array | None, float]:
-    """Return the corners (2, 2) [m] of the drawn part of the plane, and the height of the figure [100 px].
+    """Return the lower and upper corner (2, 2) [m] of the plotted area, and the height of the figure [100 px].
 
     The corners are None for a log without a reference.
     """
@@ -228,12 +230,13 @@ def _plotted_area(log: Log) -> tuple[Array | None, float]:
 
 
 def _joined(segments: Array) -> Array:
-    """Convert W segments (W, 2, 2) to one polyline (3 W, 2) with a row of NaN after each segment."""
+    """Return W segments (W, 2, 2) as one polyline (3 W, 2) with a row of NaN after each segment."""
     return np.insert(segments, 2, np.nan, axis=1).reshape(-1, 2)
 
 
 def _bounding_box(places: Array, reference: Trajectory | None) -> Array | None:
-    """Return the lower and upper corner (2, 2) of a box around points ``places`` (N, 2) and the reference, None without it."""
+    """Return the lower and upper corner (2, 2) of a box around the points ``places`` (N, 2) and the reference, with a
+    margin. None without a reference."""
     if reference is None or not len(reference):
         return None
     points = np.concatenate((places, reference.poses[:, :2]))
@@ -243,7 +246,7 @@ def _bounding_box(places: Array, reference: Trajectory | None) -> Array | None:
 
 
 def _band(axis: Axes, trajectory: Trajectory, e: Errors, row: int) -> None:
-    """Plot a component of the errors ``e`` of a trajectory over time, with a band of two standard deviations around zero.
+    """Plot a component of the errors ``e`` of a trajectory over time, and a band of two standard deviations around 0.
 
     ``row``: the component, 0 for x, 1 for y, 2 for the heading.
     """
@@ -259,8 +262,8 @@ def _band(axis: Axes, trajectory: Trajectory, e: Errors, row: int) -> None:
 
 
 def _extent(e: Errors, trajectory: Trajectory, row: int) -> float:
-    """Return the upper end of the y axis of a panel of :func:`_band`; the lower end is its negative. The panel shows
-    99.5 % of the errors and band limits."""
+    """Return the upper end of the y axis of a plot of :func:`_band`, which shows 99.5 % of the errors and band limits.
+    The lower end is its negative. ``row``: the component of the errors, as in :func:`_band`."""
     values = np.abs(e.difference[:, row])
     if trajectory.covariances is not None:
         values = np.concatenate((values, 2.0 * np.sqrt(trajectory.covariances[:, row, row])))

@@ -14,12 +14,12 @@ _DEGREES = 180.0 / math.pi
 
 @dataclass(frozen=True)
 class Metric:
-    """How a score is displayed and pooled.
+    """How a score of runs is displayed and pooled.
 
     ``key``: key of the score, such as "final.position_rmse". ``title``: name in an HTML report. There the value is
     multiplied by ``factor`` and has the unit ``unit``. ``column``: header in a table of text, with the unit of the
     value itself. ``digits``: decimals in such a table. ``rms``: whether values are pooled by the root mean square
-    instead of the mean. ``better``: "low" or "high", the values that are better, None for neither.
+    instead of the mean. ``better``: "low" if low values are better, "high" if high values are, else None.
     """
 
     title: str
@@ -93,7 +93,7 @@ REPORT = (*(f"{kind}.{what}_rmse" for what in ("position", "heading") for kind i
 
 
 def metric_of(key: str) -> Metric:
-    """Return the metric of a score by its key. For an unknown key, the title is the key and neither direction is better."""
+    """Return the metric of a score by its key. For an unknown key, the title is the key and ``better`` is None."""
     kind, _, name = key.partition(".")
     of_trajectory = ACCURACY | ALIGNED
     if kind in KINDS and name in of_trajectory:

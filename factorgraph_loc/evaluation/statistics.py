@@ -38,10 +38,10 @@ def pooled_rms(values: Sequence[float]) -> float:
 
 
 def pair_seeds(a: Mapping[int, float | None], b: Mapping[int, float | None]) -> tuple[Array, int]:
-    """Pair the scores of two methods by seed. ``a``, ``b``: by seed, the score of a run, None if it has none.
+    """Return the scores of two methods, paired by seed (K, 2), and the number of seeds that have no pair.
 
-    If a method has a single run, it is paired with each run of the other method. Returns the pairs (K, 2), and the
-    number of seeds that have no pair.
+    ``a``, ``b``: {seed: score of the run, None if it has none}. If a method has a single run, it is paired with each
+    run of the other method.
     """
     by_seed = (a, b)
     seeds = sorted(set(a) | set(b))
@@ -61,7 +61,7 @@ def bounds(figures: Array) -> tuple[float, float]:
 
 
 def draw_pooled(clusters: Sequence[Array], *, rms: bool = True) -> Array:
-    """Return bootstrap draws (DRAWS, C) of C pooled scores. Logs are drawn, and seeds within each log.
+    """Return bootstrap draws (DRAWS, C) of C pooled scores. A draw resamples the logs, and the seeds within each log.
 
     ``clusters``: for each log, the scores (K, C) of its K seeds. Scores are pooled over seeds, and then over logs with
     equal weights. ``rms``: whether to pool by the root mean square instead of the mean.
@@ -73,7 +73,7 @@ def draw_pooled(clusters: Sequence[Array], *, rms: bool = True) -> Array:
 
 @lru_cache(maxsize=2)
 def _weights(seeds: tuple[int, ...]) -> Array:
-    """Return the weight of each score in each bootstrap draw, (DRAWS, N). ``seeds``: number of seeds of each log, N in total."""
+    """Return the weights (DRAWS, N) of N scores in each bootstrap draw. ``seeds``: number of seeds of each log."""
     rng = np.random.default_rng(_SEED)
     sizes = np.array(seeds)
     logs = rng.integers(len(sizes), size=(DRAWS, len(sizes)))
@@ -89,10 +89,10 @@ def _weights(seeds: tuple[int, ...]) -> Array:
 
 @dataclass(frozen=True)
 class McNemar:
-    """The result of McNemar's test.
+    """The result of McNemar's test, which compares the frequency of an event with two methods a and b.
 
-    ``only_a``, ``only_b``: number of cases that have the event only with method a, or only with b. ``p``:
-    two-sided p value of the hypothesis that the event is equally frequent with both.
+    ``only_a``, ``only_b``: number of cases that have the event only with method a, or only with b. ``p``: two-sided p
+    value of the hypothesis that the event is equally frequent with both.
     """
 
     only_a: int
@@ -121,7 +121,7 @@ def mcnemar(a: ArrayLike, b: ArrayLike) -> McNemar:
 
 
 def quantile(values: ArrayLike, share: float) -> float:
-    """Return a quantile of N values, which may be infinite, by numpy's method "inverted_cdf". NaN if there are no values.
+    """Return a quantile of N values, which may be infinite, by numpy's method "inverted_cdf". NaN without values.
 
     ``share``: probability of the quantile, such as 0.5 for the median.
     """
@@ -130,7 +130,7 @@ def quantile(values: ArrayLike, share: float) -> float:
 
 
 def median_difference(a: ArrayLike, b: ArrayLike) -> Interval:
-    """Return the median of ``a`` (N,) minus that of ``b`` (N,), with its interval. Values may be infinite.
+    """Return the median of ``a`` (N,) minus the median of ``b`` (N,), with a 95 % interval. Values may be infinite.
 
     ``a`` and ``b`` have a value for each of the same N cases.
     """
@@ -138,9 +138,9 @@ def median_difference(a: ArrayLike, b: ArrayLike) -> Interval:
 
 
 def median_ratio(a: ArrayLike, b: ArrayLike) -> Interval:
-    """Return the median of ``a`` (N,) divided by that of ``b`` (N,), with its interval. Values may be 0 or infinite.
+    """Return the median of ``a`` (N,) divided by the median of ``b`` (N,), with a 95 % interval.
 
-    ``a`` and ``b`` have a value for each of the same N cases.
+    ``a`` and ``b`` have a value, which may be 0 or infinite, for each of the same N cases.
     """
     return _of_medians(np.divide, a, b, lowest=0.0)
 

@@ -18,8 +18,8 @@ EQUIVALENCE = 0.01  # relative difference of errors within which estimators are 
 
 
 def further_tables(rows: Sequence[Row], *, rpe: bool) -> dict[str, tuple[str, ...]]:
-    """Return the keys of the scores of additional tables, by title of the table: errors after an alignment, if the runs
-    have any, and relative errors if ``rpe`` is set."""
+    """Return {title of an additional table: keys of its scores}. There is a table of errors after an alignment if the
+    runs have such errors. There is a table of relative errors if ``rpe`` is set."""
     tables: dict[str, tuple[str, ...]] = {}
     aligned = dict.fromkeys(row["scoring.align"] for row in rows if row.get("scoring.align"))
     if aligned:
@@ -34,12 +34,12 @@ def further_tables(rows: Sequence[Row], *, rpe: bool) -> dict[str, tuple[str, ..
 
 
 def comparison_cells(rows: Sequence[Row], shown: Sequence[str] = ()) -> tuple[list[str], list[list[str]]]:
-    """Return the header and the rows of a table that compares estimators. ``shown``: keys of its scores (default
-    :data:`TABLE`).
+    """Return the header and the rows of a table that compares estimators.
 
-    RMSEs are pooled over seeds by the root mean square, and other scores by the mean. With several seeds a cell has the
-    standard deviation after ±. The last rows pool each estimator over the logs with equal weights. The column "runs"
-    has the number of successful runs. The column "poses scored" has the numbers of scored poses (see :func:`counted`).
+    ``shown``: keys of the scores in the table, :data:`TABLE` if empty. RMSEs are pooled over seeds by the root mean
+    square, and other scores by the mean. With several seeds a cell has the standard deviation after ±. The last rows
+    pool each estimator over the logs with equal weights. The column "runs" has the number of successful runs. The
+    column "poses scored" has the numbers of scored poses (see :func:`counted`).
     """
     logs = list(dict.fromkeys(row["log"] for row in rows))
     names = list(dict.fromkeys(row["estimator"] for row in rows))
@@ -63,7 +63,7 @@ def comparison_cells(rows: Sequence[Row], shown: Sequence[str] = ()) -> tuple[li
 
 
 def unscored(rows: Sequence[Row]) -> list[str]:
-    """Return a sentence with the reason for each log on which no successful run has errors."""
+    """Return a sentence for each log that has no errors in any successful run. It states the reason."""
     lines = []
     for log in dict.fromkeys(row["log"] for row in rows):
         runs = [row for row in rows if row["log"] == log and row["status"] == "ok"]
@@ -119,7 +119,7 @@ def markdown(header: Sequence[str], lines: Sequence[Sequence[str]]) -> str:
 
 
 def scored_of(row: Row) -> float | None:
-    """Return the number of scored poses of a run's causal trajectory, or of the final one if there is no causal trajectory.
+    """Return the number of scored poses of a run's causal trajectory, or of the final one if there is no causal one.
 
     Return None if there is no reference.
     """
@@ -128,7 +128,7 @@ def scored_of(row: Row) -> float | None:
 
 
 def _is_known(row: Row, figure: str) -> bool:
-    """True if the causal or the final trajectory of a run has the score ``figure``."""
+    """True if the causal or the final trajectory of a run has the score ``figure``, such as "position_rmse"."""
     return any(row.get(f"{kind}.{figure}") is not None for kind in KINDS)
 
 
@@ -140,7 +140,7 @@ def _figure(row: Row, key: str) -> float | None:
 
 
 def _cell(metric: Metric, values: Sequence[float | None]) -> str:
-    """Return a cell with a score pooled over seeds, and its standard deviation if several runs have it, such as "0.12 ±0.01".
+    """Return a cell with a score pooled over seeds. Several values have a standard deviation, such as "0.12 ±0.01".
 
     ``values``: the score of each run, None for a run without it.
     """

@@ -11,7 +11,7 @@ Row = Mapping[str, Any]  # a run: its log, estimator, seed, status and scores
 
 
 def row_of(scores: Mapping[str, Any]) -> dict[str, Any]:
-    """Convert the scores of a run to the cells of a row. Lists are omitted, except for the warnings, which become one text."""
+    """Return the scores of a run as cells of a table. Lists are omitted, but the warnings become one text."""
     cells = {name: value for name, value in scores.items() if not isinstance(value, list)}
     return cells | {WARNINGS: "\n".join(map(str, scores.get(WARNINGS, ()))) or None}
 
@@ -27,7 +27,7 @@ def by_text(rows: Sequence[Row]) -> dict[str, list[Row]]:
 
 
 def lines(rows: Sequence[Row]) -> list[str]:
-    """Return each warning once. If only some of the estimators on the same logs have a warning, their names follow it."""
+    """Return each warning once. If only some of the estimators on a log have a warning, their names follow the text."""
     texts = []
     for text, concerned in by_text(rows).items():
         logs = {row["log"] for row in concerned}
@@ -38,5 +38,5 @@ def lines(rows: Sequence[Row]) -> list[str]:
 
 
 def label_of(row: Row) -> str:
-    """Return the label of the estimator of a run in the results, which is its name if it has no label."""
+    """Return the label of the estimator of a run in tables of results: its name if it has no label."""
     return str(row.get("label") or row["estimator"])

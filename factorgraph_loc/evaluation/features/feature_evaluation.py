@@ -29,19 +29,20 @@ from factors.se2 import Array
 
 @dataclass(frozen=True)
 class Feature:
-    """A kind of point feature. ``find``: a function that detects the points of an image. It returns the points and
-    their descriptors, which are None for a detector without descriptors."""
+    """A kind of point feature. ``find``: a function that returns the keypoints of an image and their descriptors. The
+    descriptors are None for a detector without descriptors."""
 
     name: str
     find: Callable[[Image], tuple[Keypoints, Descriptors | None]]
 
 
 class MatchScores(NamedTuple):
-    """Matching scores of a pair of images. They are NaN for a detector without descriptors, and 0 if there are no matches.
+    """Matching scores of a pair of images. In a mutual match, both features are the nearest neighbour of each other.
 
     ``matching_score``: number of correct mutual matches divided by the smaller number of features in the common part of
     the images. ``matches``: number of mutual matches with a distance ratio below
     :data:`~factorgraph_loc.vision.matching.RATIO`. ``precision``: fraction of these ``matches`` that is correct.
+    Without descriptors, ``matches`` is 0 and the other scores are NaN.
     """
 
     matches: int = 0
@@ -57,7 +58,8 @@ def evaluate(
     The keys are the fields of :class:`MatchScores` and of
     :class:`~factorgraph_loc.evaluation.features.repeatability.Repeatability`, and also:
 
-    - ``feature``, ``sequence``: names. ``image``: number of the later image. ``change``, ``amount``: of the sequence.
+    - ``feature``, ``sequence``: their names. ``image``: number of the later image. ``change``: kind of change between
+      both images, such as "rotation". ``amount``: its amount.
     - ``features``: number of features in the later image. ``milliseconds``: time to compute them on one thread.
 
     ``progress`` is called after each image.
@@ -95,8 +97,9 @@ def match_scores(
     """Return the scores of the matches between two images. A match is correct if both points lie in the common part of
     the images and their regions overlap.
 
-    ``first``, ``second``: points of the images. ``mutual``: mutual nearest neighbours. ``clear``: the mutual matches with a
-    small distance ratio. ``homography``: from the first image to the second. ``shapes``: (height, width, ...) of both images.
+    ``first``, ``second``: points of the images. ``mutual``: matches of mutual nearest neighbours. ``clear``: those of
+    them with a small distance ratio. ``homography`` (3, 3): maps the first image to the second. ``shapes``: (height,
+    width, ...) of both images.
     """
     in_first, in_second = common(first, second, homography, shapes)
     features = min(int(np.count_nonzero(in_first)), int(np.count_nonzero(in_second)))

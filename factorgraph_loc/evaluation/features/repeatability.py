@@ -36,8 +36,9 @@ Shapes = tuple[tuple[int, ...], tuple[int, ...]]  # height, width, ... of both i
 class Repeatability(NamedTuple):
     """Repeatability scores of a pair of images, from 0 to 1. Both scores are 0 if ``regions`` is 0.
 
-    Regions in the common part of both images are counted in each image. ``regions``: the smaller count. ``repeatability``:
-    number of corresponding regions (:func:`overlaps`) divided by ``regions``. ``strict``: the same with :func:`alike_regions`.
+    ``regions``: the number of regions in the common part of both images; the smaller of the counts in both images.
+    ``repeatability``: number of corresponding regions (:func:`overlaps`) divided by ``regions``. ``strict``: number of
+    regions that also have similar sizes (:func:`alike_regions`), divided by ``regions``.
     """
 
     regions: int
@@ -47,10 +48,10 @@ class Repeatability(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """M pairs of regions that may correspond. ``first``, ``second`` (M,): indices of the regions in each image.
+    """M pairs of regions in two images that may correspond. ``first``, ``second`` (M,): indices of the regions.
 
-    ``error`` (M,): overlap error. ``ratio`` (M,): size of the second region in the first image, divided by that of the
-    first.
+    ``error`` (M,): overlap error. ``ratio`` (M,): size of the second region after mapping to the first image, divided
+    by the size of the first region.
     """
 
     first: Integers
@@ -59,7 +60,7 @@ class Candidates:
     ratio: Array
 
     def best(self, chosen: Truths) -> Candidates:
-        """Select one-to-one pairs from the pairs in the mask ``chosen`` (M,), in the order of increasing error."""
+        """Return pairs from the mask ``chosen`` (M,), at most one per region. Pairs with smaller errors come first."""
         taken_first: set[int] = set()
         taken_second: set[int] = set()
         rows = []
@@ -91,16 +92,16 @@ def repeatability(first: Keypoints, second: Keypoints, homography: Array, shapes
 
 
 def alike_regions(first: Keypoints, second: Keypoints, homography: Array) -> Candidates:
-    """Return one-to-one pairs of points that have a ratio of sizes below :data:`SCALE_RATIO` and overlapping regions.
-    Regions are not magnified (see :func:`overlaps`)."""
+    """Return one-to-one pairs of points with overlapping regions and a ratio of sizes below :data:`SCALE_RATIO`.
+    Regions are not magnified (see :func:`overlaps`). ``homography`` (3, 3): maps the first image to the second."""
     pairs = overlaps(first, second, homography, magnified=False)
     alike = np.maximum(pairs.ratio, 1.0 / pairs.ratio) < SCALE_RATIO
     return pairs.best((pairs.error < OVERLAP_ERROR) & alike)
 
 
 def common(first: Keypoints, second: Keypoints, homography: Array, shapes: Shapes) -> tuple[Truths, Truths]:
-    """Return for each image a mask of the points that lie inside the other image. Arguments: see
-    :func:`repeatability`."""
+    """Return a mask of the points ``first`` inside the second image, and a mask of the points ``second`` inside the
+    first image. Arguments: see :func:`repeatability`."""
     back = invert(homography)
     return (
         inside(project(homography, first.points), shapes[1]),
@@ -133,8 +134,8 @@ def overlaps(first: Keypoints, second: Keypoints, homography: Array, *, magnifie
 def pair_errors(first: Keypoints, second: Keypoints, homography: Array, *, magnified: bool = True) -> Array:
     """Return the overlap errors (N,) between the regions of the N points ``first`` and of the N points ``second``.
 
-    The error is 1 - intersection / union, and 1 for points that the homography maps to infinity. ``magnified``: see
-    :func:`overlaps`.
+    The error is 1 - intersection / union, and 1 for points that the homography (3, 3) maps to infinity. ``magnified``:
+    as in :func:`overlaps`.
     """
     back = invert(homography)
     radius = np.full(len(first), RADIUS) if magnified else MEASUREMENT * first.sizes / 2.0
@@ -176,6 +177,7 @@ def distinct(keypoints: Keypoints) -> Keypoints:
 
 
 def _sizes_in_first(second: Keypoints, homography: Array) -> Array:
-    """Return the sizes of points of the second image after mapping to the first image, as diameters of discs of equal area."""
+    """Return the sizes (N,) [px] of points of the second image after mapping to the first image. A size is the diameter
+    of a disc of equal area."""
     areas = np.abs(np.linalg.det(jacobians(invert(homography), second.points)))
     return np.asarray(second.sizes * np.sqrt(areas))

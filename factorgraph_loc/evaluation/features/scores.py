@@ -41,9 +41,10 @@ _MARKERS = ("o", "s", "^", "v", "D", "P", "X")
 def evaluate_all(
     sequences: Several[Sequence], features: Several[Feature], progress: Callable[[float, float], None]
 ) -> pl.DataFrame:
-    """Return the scores of each feature on each sequence. A score that a feature does not have is null.
+    """Return a table with the scores of each feature on each pair of images of each sequence. Missing scores are null.
 
-    ``progress`` is called with the number of processed images and the number of all images.
+    The columns are the keys of :func:`~factorgraph_loc.evaluation.features.feature_evaluation.evaluate`. ``progress``
+    is called with the number of processed images and the number of all images.
     """
     total = len(features) * sum(1 + len(sequence.others) for sequence in sequences)
     done = itertools.count(1)
@@ -57,7 +58,7 @@ def evaluate_all(
 
 
 def write_scores(scores: pl.DataFrame, out: Path) -> None:
-    """Write :data:`FILES` into the folder ``out``: tables, the scores of all pairs of images, and the plot of repeatability."""
+    """Write :data:`FILES` into the folder ``out``: tables in Markdown, the table ``scores`` of all pairs, a plot."""
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
         write_text(out / "table.md", tables(scores))
@@ -68,7 +69,8 @@ def write_scores(scores: pl.DataFrame, out: Path) -> None:
 def summary(scores: pl.DataFrame) -> tuple[list[str], list[list[str]]]:
     """Return the header and the rows of a table of the mean scores of each feature over all pairs of images.
 
-    For times it has the median, because other processes cause outliers. A dash is a score that the feature does not have.
+    Times are medians, because other processes cause outliers. A dash means that the feature does not have the score.
+    ``scores``: see :func:`evaluate_all`.
     """
     lines = []
     for name in scores["feature"].unique(maintain_order=True):
@@ -82,7 +84,7 @@ def summary(scores: pl.DataFrame) -> tuple[list[str], list[list[str]]]:
 
 
 def tables(scores: pl.DataFrame) -> str:
-    """Return tables in Markdown: the summary over all pairs of images, and for each sequence the repeatability of each pair."""
+    """Return tables in Markdown: a summary over all pairs of images, and the repeatability of each pair by sequence."""
     pairs = scores.select("sequence", "image").n_unique()
     parts = [f"Mean over {pairs} pairs of images\n", markdown(*summary(scores))]
     for sequence in scores["sequence"].unique(maintain_order=True):
@@ -96,8 +98,8 @@ def tables(scores: pl.DataFrame) -> str:
 
 
 def figure3(scores: pl.DataFrame) -> Any:
-    """Plot repeatability over the amount of change, with a panel for each sequence. Sequences that were made from
-    different photographs by the same changes share a panel, and their scores are averaged."""
+    """Return a figure of repeatability over the amount of change, with a panel for each sequence. Sequences that were
+    made from different photographs by the same changes share a panel, and their scores are averaged."""
     panels = _panels(scores)
     names = scores["feature"].unique(maintain_order=True).to_list()
     figure, axes = grid(len(panels), 1, 3.6 * len(panels) + 1.2)
@@ -113,7 +115,7 @@ def figure3(scores: pl.DataFrame) -> Any:
 
 
 def _panels(scores: pl.DataFrame) -> dict[str, pl.DataFrame]:
-    """Return {title of a panel: the scores in it}. Sequences made from photographs by the same changes share a panel."""
+    """Return {title of a panel: its rows of ``scores``}. Sequences made by the same changes share a panel."""
     members: dict[tuple[Any, ...], list[str]] = {}
     for sequence in scores["sequence"].unique(maintain_order=True):
         rows = scores.filter(pl.col("sequence") == sequence)

@@ -33,10 +33,10 @@ _SUFFIXES = ("", ".txt", ".xml")
 
 
 class ViewChange(NamedTuple):
-    """Change of view from a first image to a second one.
+    """Change of view from a first image to a second one. ``zoom``: above 1 if the scene is larger in the second image.
 
-    ``zoom``: above 1 if the scene is larger in the second image. ``rotation`` [rad]. ``tilt``: the ratio of the axes of
-    the ellipse to which a small circle is mapped, at least 1.
+    ``rotation`` [rad]. ``tilt``: a small circle in the first image becomes an ellipse in the second image. The tilt is
+    the ratio of the axes of this ellipse, at least 1.
     """
 
     zoom: float
@@ -45,7 +45,7 @@ class ViewChange(NamedTuple):
 
 
 def project(homography: Array, points: Array) -> Array:
-    """Map points (N, 2) [px] of the first image to the second image (N, 2). A point without a finite image becomes NaN.
+    """Return the pixels (N, 2) in the second image of ``points`` (N, 2) [px] in the first image, NaN if infinite.
 
     ``homography`` (3, 3): a matrix that :func:`checked` returned, or its inverse.
     """
@@ -68,19 +68,19 @@ def invert(homography: Array) -> Array:
 
 
 def inside(points: Array, shape: tuple[int, ...]) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Return a mask (N,) of the ``points`` (N, 2) that lie in an image of ``shape`` (height, width, ...). NaN lies outside."""
+    """Return a mask (N,) of the ``points`` (N, 2) in an image of ``shape`` (height, width, ...). NaN lies outside."""
     last = np.array((shape[1] - 1.0, shape[0] - 1.0))
     return np.asarray(np.all((points >= 0.0) & (points <= last), axis=1))
 
 
 def corners(shape: tuple[int, ...]) -> Array:
-    """Return the centres (4, 2) of the corner pixels of an image of ``shape`` (height, width, ...)."""
+    """Return the centres (4, 2) [px] of the corner pixels of an image of ``shape`` (height, width, ...)."""
     right, bottom = shape[1] - 1.0, shape[0] - 1.0
     return np.array(((0.0, 0.0), (right, 0.0), (right, bottom), (0.0, bottom)))
 
 
 def view(homography: Array, shape: tuple[int, ...]) -> ViewChange:
-    """Return zoom, rotation and tilt of a ``homography`` at the centre of the first image of ``shape`` (height, width, ...)."""
+    """Return zoom, rotation and tilt of a ``homography`` at the centre of the first image. ``shape``: of this image."""
     (local,) = jacobians(homography, corners(shape).mean(axis=0, keepdims=True))
     left, axes, right = np.linalg.svd(local)
     turn = left @ right
@@ -90,9 +90,10 @@ def view(homography: Array, shape: tuple[int, ...]) -> ViewChange:
 
 
 def checked(matrix: Array, shape: tuple[int, ...], source: object) -> Array:
-    """Check a homography (3, 3), and return it scaled so that third homogeneous coordinates are positive in the first image.
+    """Return a homography (3, 3), scaled so that the third homogeneous coordinate is positive in the first image.
 
-    ``shape``: of the first image. Raises InputError with the file name ``source`` if it is not a valid homography.
+    ``shape``: (height, width, ...) of the first image. ``source``: file name for messages. Raises InputError if
+    ``matrix`` is not a valid homography.
     """
     if matrix.shape != (3, 3):
         raise InputError(f"{source}: has {matrix.size} numbers, expected the 9 numbers of a homography")
@@ -112,7 +113,7 @@ def checked(matrix: Array, shape: tuple[int, ...], source: object) -> Array:
 
 
 def read_homography(path: Path, shape: tuple[int, ...]) -> Array:
-    """Read a homography (3, 3) from a file with nine numbers, or with a matrix in OpenCV's XML format.
+    """Return the homography (3, 3) in a file with nine numbers, or with a matrix in OpenCV's XML format.
 
     ``shape``: of the first image. Raises InputError if the file cannot be read or :func:`checked` rejects the matrix.
     """
@@ -136,7 +137,8 @@ def read_homography(path: Path, shape: tuple[int, ...]) -> Array:
 class Sequence:
     """A first image, other images, and the homographies (3, 3) [px] from the first image to each other image.
 
-    ``change``: the dominant change, such as "scale change". ``amounts``: the amount of the change in each other image.
+    ``change``: the dominant change, such as "scale change". ``amounts``: its amount in each other image. This is a
+    ratio, an angle [degrees], or the number of the image if no change dominates.
     """
 
     name: str
@@ -148,8 +150,8 @@ class Sequence:
 
 
 def find_sequences(paths: Several[Path]) -> list[Sequence]:
-    """Read sequences of images. A path is a folder with a sequence, a folder of such folders, or a photograph, from
-    which :func:`warped` makes two sequences.
+    """Return the image sequences in the given paths. A path is a folder with a sequence, or a folder of such folders.
+    It may also be a photograph: :func:`warped` makes two sequences of it.
 
     Raises InputError for other paths and for damaged files.
     """
@@ -171,7 +173,10 @@ def find_sequences(paths: Several[Path]) -> list[Sequence]:
 
 
 def read_sequence(folder: Path) -> Sequence:
-    """Read the sequence in a folder. Raises InputError for a missing or damaged file."""
+    """Return the sequence in a folder: the images ``imgK.*`` and the homographies ``H1toKp``, with K from 1 or 2 on.
+
+    Raises InputError for a missing or damaged file.
+    """
     paths = _images(folder)
     if sorted(paths) != list(range(1, len(paths) + 1)) or len(paths) < 2:
         missing = next(k for k in range(1, max(paths, default=0) + 2) if k not in paths)
@@ -190,10 +195,10 @@ def read_sequence(folder: Path) -> Sequence:
 
 
 def warped(photograph: Image, source: Path) -> list[Sequence]:
-    """Make two sequences from a photograph: reduced by :data:`ZOOMS`, and rotated by :data:`ROTATIONS`.
+    """Return two sequences made from a photograph: reduced by :data:`ZOOMS`, and rotated by :data:`ROTATIONS`.
 
     The background of a reduced photograph is its mirror image at full size. All images of the rotated sequence are
-    cropped to the largest square without empty corners. ``source``: file of the photograph, for the names of the
+    cropped to the largest square without empty corners. ``source``: path of the photograph, used for the names of the
     sequences and for messages. Raises InputError if the photograph is too small.
     """
     height, width = photograph.shape[:2]
@@ -247,7 +252,7 @@ def _rotated(photograph: Image, name: str) -> Sequence:
 
 
 def _images(folder: Path) -> dict[int, Path]:
-    """Return the files ``imgK.*`` of a folder by the number K. Raises InputError if several files have the same number."""
+    """Return the files ``imgK.*`` of a folder by K. Raises InputError if several files have the same number K."""
     files: dict[int, Path] = {}
     for path in sorted(folder.iterdir()):
         match = re.fullmatch(r"img(\d+)\.\w+", path.name)

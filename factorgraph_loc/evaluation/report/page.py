@@ -34,11 +34,11 @@ def write_report(
     damaged: Sequence[str] = (),
     versions: Mapping[str, str] | None = None,
 ) -> None:
-    """Write the report with the heading ``title`` to the file ``out``.
+    """Write a report about runs as an HTML page. ``out``: path of the page. ``title``: heading of the page.
 
     ``rows``: a row for each run, with key, log, estimator, seed, status (ok, failed), reason and scores. Optional
-    columns are label, sensors, kind (of a failure), warnings and ``sweep.*``.
-    ``runs``: a function that returns the result files of a run by its key. ``metrics``: keys of the scores to show.
+    columns are label, sensors, kind (of a failure), warnings and ``sweep.*``. ``runs``: a function that returns the
+    result files of a run by its key, and the map of its log or None. ``metrics``: keys of the scores to show.
     ``baseline``: label of the runs with which all other runs are compared. If it is None or no run has it, the first
     label is used. ``experiment``: content of the experiment file. ``damaged``: descriptions of runs with unusable
     results. ``versions``: version of each used software by name.
@@ -84,7 +84,8 @@ def write_report(
 
 
 def _row_variables(results: Results, metrics: Sequence[Metric], baseline: str) -> dict[str, Any]:
-    """Return the variables of the HTML template that depend only on the rows of the runs."""
+    """Return the variables of the HTML template that depend only on the table of runs. ``baseline``: name of the
+    variant with which the others are compared."""
     best = [results.compare(metric) for metric in metrics]
     against = [results.compare(metric, baseline) for metric in metrics]
     times = _scored_metrics(results, tuple(TIMINGS), whole=False)
@@ -109,8 +110,8 @@ def _row_variables(results: Results, metrics: Sequence[Metric], baseline: str) -
 
 
 def _file_variables(results: Results, metric: str, runs: Runs) -> dict[str, Any]:
-    """Return the variables of the HTML template that are read from the files of the runs. Only one trajectory per
-    variant and log is shown: that of the run with the median of the score ``metric`` over seeds."""
+    """Return the variables of the HTML template that are read from the files of the runs. ``metric``: the trajectory of
+    each variant and log is from the seed with the median of this score."""
     read = read_runs(results, metric, runs)
     return {
         "tracks": read.tracks,
@@ -125,7 +126,7 @@ def _file_variables(results: Results, metric: str, runs: Runs) -> dict[str, Any]
 
 
 def _scored_metrics(results: Results, keys: Sequence[str], *, whole: bool = True) -> list[Metric]:
-    """Return the metrics with the given ``keys`` for which at least one run has a score. If there are none, return all
+    """Return the metrics with the given ``keys`` that have a score in at least one run. If there are none, return all
     metrics, or an empty list if ``whole`` is false."""
     known = [metric_of(k) for k in keys if any(score(row, k) is not None for row in results.rows)]
     return known or ([metric_of(k) for k in keys] if whole else [])

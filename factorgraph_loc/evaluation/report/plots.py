@@ -32,7 +32,7 @@ _NAME = 40  # maximum length of a name at an axis
 
 @dataclass(frozen=True)
 class _Row:
-    """A row of a chart of dots: a variant, its ``values`` on each log, and a ``mark`` at their median or mean.
+    """A row of a dot plot: the ``values`` of a variant on each log, and a ``mark`` at their median or mean.
 
     ``band``: the expected interval of the mark, or None.
     """
@@ -45,9 +45,9 @@ class _Row:
 
 
 def ratios(results: Results, comparisons: Sequence[MetricComparison]) -> Picture | None:
-    """Plot the score of each variant divided by that of the reference variant, on each log. Each metric has a panel.
+    """Return a plot of each variant's score on each log, divided by the score of the reference variant.
 
-    Return None if there are no ratios.
+    A variant is an estimator with its settings. ``comparisons``: one for each metric. Returns None without ratios.
     """
     panels = {}
     for c in comparisons:
@@ -66,10 +66,10 @@ def ratios(results: Results, comparisons: Sequence[MetricComparison]) -> Picture
 def consistency(
     results: Results, trust: Mapping[str, tuple[float, float, float]], nees: Mapping[tuple[str, str], float]
 ) -> Picture | None:
-    """Plot the mean NEES of each variant on each log, the mean over logs, and its 95 % interval for correct covariances.
+    """Return a plot of the mean NEES of each variant on each log, of the mean over logs, and of its 95 % interval.
 
-    ``trust``: by variant, the mean over logs and the bounds of the interval. ``nees``: by variant and log, the mean
-    NEES. Return None if there are no values.
+    ``trust``: by variant, the mean over logs and the bounds of the interval for correct covariances. ``nees``: by
+    variant and log, the mean NEES. Returns None if there are no values.
     """
     rows = []
     for variant, colour in zip(results.variants, cycle(COLOURS), strict=False):
@@ -82,7 +82,7 @@ def consistency(
 
 
 def times(results: Results, metric: Metric) -> Picture | None:
-    """Plot a computing time of each variant on each log, as the median over seeds. Return None if there are no times."""
+    """Return a plot of a computing time of each variant on each log, as the median over seeds. None without times."""
     rows = []
     for variant, colour in zip(results.variants, cycle(COLOURS), strict=False):
         by_log = [
@@ -95,10 +95,10 @@ def times(results: Results, metric: Metric) -> Picture | None:
 
 
 def distributions(results: Results, errors: Mapping[str, Mapping[tuple[str, str], Array]]) -> Picture | None:
-    """Plot the distribution of position errors of causal and final poses, over the logs on which every variant has
-    errors.
+    """Return a plot of the distributions of position errors of causal and final poses.
 
-    ``errors``: by kind of trajectory, variant and log, quantiles of the position error [m]. Return None without errors.
+    Only logs with errors of every variant are used. ``errors``: by kind of trajectory, variant and log, quantiles of
+    the position error [m]. Returns None without errors.
     """
     figure, axes = grid(1, len(KINDS), 5.5)
     for axis, kind in zip(axes[0], KINDS, strict=True):
@@ -119,7 +119,7 @@ def distributions(results: Results, errors: Mapping[str, Mapping[tuple[str, str]
 
 
 def sweeps(results: Results, metrics: Sequence[Metric]) -> Picture | None:
-    """Plot each metric over the values of each swept setting. Return None if no swept setting is a number."""
+    """Return a plot of each metric over the values of each swept setting, None if no swept setting is a number."""
     every = {(column, m): sweep(results, column, m) for column in results.sweeps for m in metrics}
     panels = {key: lines for key, lines in every.items() if any(len(points) > 1 for points in lines.values())}
     if not panels:
@@ -136,10 +136,10 @@ def sweeps(results: Results, metrics: Sequence[Metric]) -> Picture | None:
 
 
 def sweep(results: Results, column: str, metric: Metric) -> dict[str, list[tuple[float, float, float, float]]]:
-    """Return {name of a line: its points} for a plot of a metric over a swept setting. ``column``: the setting.
+    """Return {name of a line: its points} for a plot of a metric over the swept setting ``column``.
 
-    There is a line for each label and each combination of the other swept settings. A point consists of the value of the
-    setting, the pooled metric, and the bounds of its interval. Without an interval, the bounds are the range of the metric.
+    There is a line for each label and each combination of the other swept settings. A point consists of the value of
+    the setting, the pooled metric, and the bounds of its interval, or its minimum and maximum without an interval.
     """
     lines: dict[str, dict[float, dict[str, dict[int, float | None]]]] = {}
     for variant in results.variants:
@@ -156,7 +156,7 @@ def sweep(results: Results, column: str, metric: Metric) -> dict[str, list[tuple
 def _points(
     metric: Metric, by_value: Mapping[float, dict[str, dict[int, float | None]]]
 ) -> Iterator[tuple[float, float, float, float]]:
-    """Yield the points of a line of :func:`sweep`. ``by_value``: scores of ``metric`` by value of the setting, log and seed."""
+    """Yield the points of a line of :func:`sweep`. ``by_value``: {value of the setting: {log: {seed: score}}}."""
     for value, scores in sorted(by_value.items()):
         figure = pooled(scores, rms=metric.rms)
         if figure is not None:
@@ -166,13 +166,13 @@ def _points(
 
 
 def _line_name(results: Results, variant: str, row: Mapping[str, Any], column: str) -> str:
-    """Return the name of a line: the label of a run, and its swept settings except ``column``, the setting on the axis."""
+    """Return the name of a line: the label of a run, and its swept settings except ``column``, which is on the axis."""
     columns = [c for c in results.sweeps if c != column and row.get(c) is not None]
     return ", ".join([results.variants[variant], *(f"{short_name(c)} {row[c]}" for c in columns)])
 
 
 def _panels(count: int, height: float) -> tuple[Figure, list[Axes]]:
-    """Return a figure and its ``count`` axes, in two columns if there are several. ``height``: of one panel [100 px]."""
+    """Return a figure and its ``count`` axes, in two columns if there are several. ``height`` [100 px]: of one row."""
     columns = min(count, 2)
     figure, axes = grid(math.ceil(count / columns), columns, height * math.ceil(count / columns))
     for axis in axes.flat[count:]:
@@ -181,9 +181,10 @@ def _panels(count: int, height: float) -> tuple[Figure, list[Axes]]:
 
 
 def _dots(panels: Mapping[str, Sequence[_Row]], title: str, mark: str, *, ideal: float | None = None) -> Picture | None:
-    """Plot rows of dots on a logarithmic axis. ``panels``: the rows of each panel by its title. Return None without panels.
+    """Return a plot of rows of dots on a logarithmic axis. ``panels``: the rows of each panel by its title.
 
     ``title``: label of the axis. ``mark``: label of the marks of the rows. ``ideal``: ideal value, drawn as a line.
+    Returns None without panels.
     """
     if not panels:
         return None

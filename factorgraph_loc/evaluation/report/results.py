@@ -42,13 +42,12 @@ Runs = Callable[[str], tuple[ResultFiles, Scene | None]]
 
 @dataclass
 class RunData:
-    """The data that are read from the files of all runs.
+    """The data of a report that are read from the files of all runs.
 
-    ``tracks``: by log, its map and trajectories with a reduced number of poses.
-    ``errors``: by kind of trajectory (causal, final), variant and log, quantiles of the position error [m].
-    ``nees``: by variant and log, the mean NEES of the causal poses. ``trust``: by variant, the mean of ``nees`` over
-    logs and the bounds of its 95 % interval for correct covariances. ``configs``: {variant, log and seed as text:
-    content of the run's config file}.
+    ``tracks``: by log, its map and trajectories with a reduced number of poses. ``errors``: by kind of trajectory
+    (causal, final), then by variant and log, quantiles of the position error [m]. ``nees``: by variant and log, the
+    mean NEES of the causal poses. ``trust``: by variant, the mean of ``nees`` over logs and the bounds of its 95 %
+    interval for correct covariances. ``configs``: {variant, log and seed as text: content of the run's config file}.
     """
 
     tracks: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -59,7 +58,8 @@ class RunData:
 
 
 def read_runs(results: Results, metric: str, runs: Runs) -> RunData:
-    """Read the files of all successful runs. Of several seeds, the run with the median of the score ``metric`` is drawn."""
+    """Return the data in the files of all successful runs. ``runs``: returns the files of a run by its key. If a
+    variant ran with several seeds on a log, the trajectory with the median of the score ``metric`` is used."""
     data = RunData()
     chosen = {
         (variant, log): row
@@ -109,7 +109,7 @@ def read_runs(results: Results, metric: str, runs: Runs) -> RunData:
 
 
 def _series(files: ResultFiles) -> dict[str, Estimates]:
-    """Return the estimates of a run by kind (causal, final), without kinds that have no poses."""
+    """Return the estimates of a run as {"causal" or "final": estimates}, without trajectories that have no poses."""
     return {kind: estimates for kind, estimates in files.estimates().items() if len(estimates.trajectory)}
 
 
@@ -117,9 +117,10 @@ def _series(files: ResultFiles) -> dict[str, Estimates]:
 class MetricComparison:
     """Comparison of the variants (estimators with certain settings and sensors) by one metric.
 
-    ``pooled``: by variant, the pooled score; variants without scores are missing. ``best``: the best of the variants that have a
-    score on every log, None if there is none. ``reference``: the variant with which the others are compared. ``contrasts``: by
-    variant, the difference from the reference. ``p``: by variant, the p value, corrected for the number of comparisons.
+    ``pooled``: by variant, the pooled score; variants without scores are missing. ``best``: the best of the variants
+    that have a score on every log, None if there is none. ``reference``: the variant with which the others are
+    compared. ``contrasts``: by variant, the difference from the reference. ``p``: by variant, the p value, corrected
+    for the number of comparisons.
     """
 
     metric: Metric
@@ -131,7 +132,7 @@ class MetricComparison:
 
     @property
     def tied(self) -> list[str]:
-        """The variants that do not differ significantly from the reference, although the test has enough data."""
+        """The variants without a significant difference from the reference, if the test could find a difference."""
         return [v for v, p in self.p.items() if self.has_power and p is not None and not self.is_significant(v)]
 
     @property
@@ -141,7 +142,7 @@ class MetricComparison:
 
     @property
     def incomplete(self) -> list[str]:
-        """The variants that have no score on some of the logs of the best variant."""
+        """The variants that lack a score on some of the logs that the best variant has."""
         assert self.best is not None
         return [v for v, c in self.contrasts.items() if c.count < self.pooled[self.best].count]
 
@@ -180,7 +181,7 @@ class Results:
             self._runs.setdefault((variant, log), []).append(row)
 
     def runs(self, variant: str, log: str) -> list[Row]:
-        """Return the runs of a variant on a log."""
+        """Return the runs of a variant on a log, as rows with the seed and the scores."""
         return self._runs.get((variant, log), [])
 
     def of(self, variant: str) -> list[Row]:
@@ -188,20 +189,20 @@ class Results:
         return [row for log in self.logs for row in self.runs(variant, log)]
 
     def scores(self, metric: str, variant: str) -> dict[str, dict[int, float | None]]:
-        """Return the score ``metric`` of a variant as {log: {seed: value}}. The value is None for failed runs and
-        missing scores."""
+        """Return the score ``metric`` of a variant as {log: {seed: value}}. Failed runs and missing scores are None."""
         by_log = {log: {row["seed"]: score(row, metric) for row in self.runs(variant, log)} for log in self.logs}
         return {log: seeds for log, seeds in by_log.items() if seeds}
 
     def representative(self, variant: str, log: str, metric: str) -> Row | None:
         """Return the run of a variant on a log with the median of the score ``metric``. Without scores, return the
-        first successful run, or None."""
+        first successful run, or None if there is none."""
         well = [row for row in self.runs(variant, log) if row["status"] == "ok"]
         ranked = sorted((s, i) for i, row in enumerate(well) if (s := score(row, metric)) is not None)
         return well[ranked[(len(ranked) - 1) // 2][1]] if ranked else next(iter(well), None)
 
     def compare(self, metric: Metric, reference: str | None = None) -> MetricComparison:
-        """Compare all variants with a ``reference`` variant. If it is None, compare with the best variant, without intervals."""
+        """Return a comparison of all variants with a ``reference`` variant. If it is None, the best variant is the
+        reference, and intervals are not computed."""
         scores = {name: self.scores(metric.key, name) for name in self.variants}
         figures = {name: p for name in scores if (p := self._pool(metric, name, scores[name])) is not None}
         best = _best(metric, scores, figures)
@@ -232,7 +233,7 @@ class Results:
         ]
 
     def _pool(self, metric: Metric, variant: str, scores: ByLog) -> Pooled | None:
-        """Return the pooled score of a variant from a cache, or compute it. Return None if there are no scores."""
+        """Return the pooled score of a variant, from a cache if possible. Return None if there are no scores."""
         key = (metric.key, variant)
         if key not in self._pooled:
             self._pooled[key] = pooled(scores, rms=metric.rms, alike=self.logs)
@@ -249,7 +250,8 @@ class Results:
         return _named(str(row["log"]), self._swept(row, of_log=True))
 
     def _swept(self, row: Row, *, of_log: bool) -> list[str]:
-        """Return the swept settings of a run as texts "name value": of the simulation if ``of_log``, else of the estimator."""
+        """Return the swept settings of a run as texts "name value". ``of_log``: settings of the simulation if true,
+        else of the estimator."""
         known = [c for c in self.sweeps if row.get(c) is not None and of_log == c.startswith(f"{SWEEP}{SIMULATION}.")]
         return [f"{short_name(c)} {f'{row[c]:g}' if isinstance(row[c], float) else row[c]}" for c in known]
 
@@ -264,7 +266,7 @@ def short_name(key: str) -> str:
 
 
 def score(row: Row, metric: str) -> float | None:
-    """Return the score ``metric`` of a run. Return None if the run failed, has no such score, or has too few scored poses.
+    """Return the score ``metric`` of a run. None if the run failed, has no such score, or has too few scored poses.
 
     Update times of batch estimators are None, because their updates only collect measurements.
     """
@@ -279,8 +281,7 @@ def score(row: Row, metric: str) -> float | None:
 
 
 def _best(metric: Metric, scores: Mapping[str, ByLog], figures: Mapping[str, Pooled]) -> str | None:
-    """Return the best variant, or None if there is none. A variant without scores on some of the logs is not
-    considered."""
+    """Return the variant with the best pooled score, or None. A variant must have a score on all logs."""
     if metric.better is None or not figures:
         return None
     complete = {

@@ -21,14 +21,15 @@ _NONE = "–"
 
 
 def name(results: Results, variant: str) -> Cell:
-    """Return a cell with the name of a variant and a mark in its colour."""
+    """Return a cell with the name of a variant (an estimator with its settings) and a mark in its colour."""
     return Cell(variant, colour=list(results.variants).index(variant))
 
 
 def overview(results: Results, comparisons: Sequence[MetricComparison]) -> Table:
-    """Return the table of scores pooled over all logs, with a row for each variant and a column for each metric.
+    """Return a table of scores pooled over all logs, with a row for each variant and a column for each metric.
 
-    The best variant of each metric is marked. Further columns have the numbers of localized runs, scored poses and successful runs.
+    A variant is an estimator with its settings. The best variant of each metric is marked. Further columns have the
+    numbers of localized runs, scored poses and successful runs.
     """
     # the number of localized runs is shown only if a run had to be localized first
     is_sought = any(row.get("time_to_localized") for row in results.rows)
@@ -45,9 +46,9 @@ def overview(results: Results, comparisons: Sequence[MetricComparison]) -> Table
 
 
 def differences(results: Results, comparisons: Sequence[MetricComparison]) -> Table:
-    """Return the table of differences between each variant and the baseline, with interval, corrected p value and effect size.
+    """Return a table of differences between each variant and the baseline, an estimator with its settings.
 
-    A difference that is not significant is grey.
+    A cell has the interval, the corrected p value and the effect size. Differences that are not significant are grey.
     """
     baseline = comparisons[0].reference
     rows = []
@@ -58,7 +59,8 @@ def differences(results: Results, comparisons: Sequence[MetricComparison]) -> Ta
 
 
 def by_log(results: Results, metric: Metric) -> Table:
-    """Return the table of a score with a row for each log and a column for each variant. The best of each row is marked."""
+    """Return a table of a score with a row for each log, and a column for each variant (estimator with its settings).
+    The best score of each row is marked."""
     rows = []
     for log in results.logs:
         scores = {v: _known(results.runs(v, log), metric) for v in results.variants}
@@ -71,7 +73,7 @@ def by_log(results: Results, metric: Metric) -> Table:
 
 
 def timing(results: Results, metrics: Sequence[Metric]) -> Table:
-    """Return the table of computing times: for each variant and metric the median over runs, and the range."""
+    """Return a table of computing times: for each variant and metric the median over runs, and the range."""
     rows = []
     for variant in results.variants:
         cells = []
@@ -84,7 +86,7 @@ def timing(results: Results, metrics: Sequence[Metric]) -> Table:
 
 
 def failures(results: Results) -> Table:
-    """Return the table of failed runs, grouped by estimator and reason."""
+    """Return a table of failed runs, grouped by estimator and reason."""
     failed = [row for row in results.rows if row["status"] != "ok"]
     groups: dict[tuple[str, str, str], list[Row]] = {}
     for row in failed:
@@ -98,7 +100,7 @@ def failures(results: Results) -> Table:
 
 
 def warnings(results: Results) -> Table:
-    """Return the table of warnings. A row has a warning and the runs that have it."""
+    """Return a table of warnings, with the number of runs that have each warning, and the first of these runs."""
     rows: list[list[str | int]] = []
     for text, concerned in by_text(results.rows).items():
         where = dict.fromkeys(f"{row['log']}, {label_of(row)}" for row in concerned)
@@ -107,7 +109,7 @@ def warnings(results: Results) -> Table:
 
 
 def cautions(results: Results, comparisons: Sequence[MetricComparison]) -> list[str]:
-    """Return sentences about logs that are not scored, and about differences that cannot be significant."""
+    """Return sentences about logs without scores, and about differences that cannot be significant."""
     said = []
     if poor := results.unscored():
         said.append(
@@ -143,7 +145,7 @@ def uncertainty(metric: Metric, figure: Pooled) -> str:
 
 
 def _pooled_cell(c: MetricComparison, variant: str) -> Cell:
-    """Return a cell with the pooled score of a variant. ● marks the best, ○ one that does not differ significantly from it."""
+    """Return a cell with the pooled score of a variant. ● marks the best. ○ marks no significant difference from it."""
     figure = c.pooled.get(variant)
     if figure is None:
         return Cell(_NONE)
@@ -173,8 +175,8 @@ def _difference_cell(c: MetricComparison, variant: str) -> Cell:
 
 
 def _log_cell(metric: Metric, known: Sequence[float], planned: int, best: float | None) -> Cell:
-    """Return a cell with a score on one log. ``known``: the scores of its runs. ``planned``: number of all runs.
-    ``best``: best score in the row."""
+    """Return a cell with a score on one log. ``known``: the scores of the runs that have one. ``planned``: number of
+    all runs. ``best``: best score in the row."""
     if not known:
         return Cell(_NONE)
     value = float(average(known, rms=metric.rms))

@@ -28,10 +28,10 @@ Place = tuple[float, float]
 
 
 class Scene(BaseModel, frozen=True, allow_inf_nan=False):
-    """Map and reference of a log in the world frame [m].
+    """Map and reference of a log in the world frame [m], for plots in a page. ``walls``: endpoints x1, y1, x2, y2.
 
-    ``walls``: endpoints x1, y1, x2, y2. ``layers``: by layer of the map, such as landmarks or tags, the positions of its objects.
-    ``reference``: positions in pieces, which are divided at long gaps. ``t0_ns``: timestamp of the log's start.
+    ``layers``: by layer of the map, such as landmarks or tags, the positions of its objects. ``reference``: positions
+    in pieces, which are divided at long gaps. ``t0_ns``: timestamp of the log's start.
     """
 
     walls: list[tuple[float, float, float, float]]
@@ -79,7 +79,7 @@ def sigma(estimates: Estimates) -> Array:
 
 
 def thinned(estimates: Estimates, count: int) -> dict[str, list[float | None]]:
-    """Select about ``count`` poses of a trajectory, and return them as lists of rounded numbers, None for unknown ones.
+    """Return about ``count`` selected poses of a trajectory, as lists of rounded numbers. Unknown numbers are None.
 
     The lists are ``t`` [s], ``x``, ``y`` [m], ``e`` (position error [m]) and ``s`` (see :func:`sigma`). The trajectory
     is divided into intervals, and the poses with the smallest and the largest error of each interval are selected.
@@ -95,13 +95,13 @@ def thinned(estimates: Estimates, count: int) -> dict[str, list[float | None]]:
 
 
 def quantiles(errors: Sequence[Array]) -> Array:
-    """Return the quantiles at :data:`LEVELS` of the errors of several runs together. Empty if there are no errors."""
+    """Return the quantiles (51,) at :data:`LEVELS` of the pooled errors of several runs. Empty without errors."""
     known = _known(np.concatenate(errors)) if errors else np.empty(0)
     return np.quantile(known, LEVELS) if len(known) else known
 
 
 def consistency(estimates: Estimates) -> tuple[float, float, int] | None:
-    """Return the mean NEES of a trajectory, the effective number of independent values in it, and the degrees of freedom.
+    """Return the mean NEES of a trajectory, its effective number of independent values, and the degrees of freedom.
 
     Return None if fewer than two NEES are known.
     """
@@ -115,8 +115,10 @@ def _known(values: Array) -> Array:
 
 
 def _thinned_rows(error: Array, count: int) -> NDArray[np.int64]:
-    """Select about ``count`` of N poses, and return their indices: the first and the last pose, and the poses with the smallest and
-    the largest ``error`` (N,) of each of several intervals. Where no error is known, the selected poses are evenly spaced.
+    """Return the indices of about ``count`` selected poses of N. They include the first and the last pose.
+
+    The other poses have the smallest or the largest ``error`` (N,) of one of several intervals. In an interval without
+    known errors, one pose is selected.
     """
     if len(error) <= count:
         return np.arange(len(error))

@@ -28,8 +28,8 @@ _DEGENERATE = 1e-12  # positions are on a line if the second squared singular va
 class Associated:
     """N poses of an ``estimate``, and the N poses of the ``reference`` with which they are compared.
 
-    ``gaps``: indices of poses that follow a gap. Relative errors are not computed across gaps. ``from_reference``:
-    whether the lengths of pieces for relative errors are measured along the reference instead of the estimate.
+    ``gaps``: indices of poses that follow a gap. Relative errors are not computed across gaps. ``from_reference``: if
+    true, the lengths of pieces for relative errors are measured along the reference, otherwise along the estimate.
     """
 
     estimate: PosePath
@@ -41,15 +41,15 @@ class Associated:
 def associate(
     estimate: PosePath, reference: PosePath, how: Association, *, max_diff: float, max_gap: float
 ) -> Associated:
-    """Pair the poses of an estimate with poses of the reference.
+    """Return N poses of an estimate, paired with N poses of the reference.
 
     If a trajectory has no timestamps, poses are paired by index, and both must have the same number of poses. Otherwise
     ``how`` is one of these:
 
     - "nearest": each pose of the trajectory with fewer poses is paired with the pose of the other that is nearest in
       time. Poses more than ``max_diff`` [s] apart are not paired.
-    - "interpolate": the estimate is interpolated at timestamps of the reference, across gaps of at most ``max_gap``
-      [s], see :mod:`factorgraph_loc.evaluation.pairing`. If one trajectory is planar, both are compared in the plane.
+    - "interpolate": the estimate is interpolated at timestamps of the reference, across gaps of at most
+      ``max_gap`` [s]. If one trajectory is planar, both are compared in the plane.
 
     Raises InputError if there are no pairs.
     """
@@ -90,7 +90,8 @@ def _nearest(estimate: Array, reference: Array, max_diff: float) -> tuple[Intege
 
 
 def _interpolated(estimate: PosePath, reference: PosePath, max_gap: float) -> Associated:
-    """Pair interpolated poses of the estimate with poses of the reference, in the plane if one trajectory is planar."""
+    """Return poses of the estimate, interpolated at timestamps of the reference, paired with poses of the reference. If
+    one trajectory is planar, both are compared in the plane."""
     t0_ns = int(estimate.stamps()[0])
     if estimate.is_planar or reference.is_planar:
         above, true = (Trajectory.of(path.seen_from_above(), t0_ns) for path in (estimate, reference))
@@ -102,9 +103,9 @@ def _interpolated(estimate: PosePath, reference: PosePath, max_gap: float) -> As
 def in_plane(
     pair: Pairs, estimate: Trajectory, reference: Trajectory, names: tuple[str, str] = ("", ""), t0_ns: int = 0
 ) -> Associated:
-    """Convert the paired poses ``pair`` of two planar trajectories to poses in space. Pairs with NaN are omitted as gaps.
+    """Return the paired poses ``pair`` of two planar trajectories as poses in space. Pairs with NaN become gaps.
 
-    ``estimate``, ``reference``: the trajectories that were paired. ``names``: their names. ``t0_ns``: timestamp of the time 0.
+    ``estimate``, ``reference``: the paired trajectories. ``names``: their names. ``t0_ns``: timestamp of the time 0.
     """
     known = np.isfinite(pair.poses[:, 0]) & np.isfinite(pair.truth[:, 0])
     kept = np.flatnonzero(known)
@@ -136,7 +137,7 @@ def _nothing_in_common(
 
 @dataclass(frozen=True)
 class Similarity:
-    """The transformation ``scale * rotation @ p + translation`` of a point p. ``rotation`` (3, 3), ``translation`` (3,) [m]."""
+    """The transformation ``scale * rotation @ p + translation`` of a point p. ``translation`` (3,) [m]."""
 
     rotation: Array
     translation: Array
@@ -154,12 +155,14 @@ IDENTITY = Similarity(np.eye(3), np.zeros(3))
 def alignment(estimate: PosePath, reference: PosePath, how: Alignment) -> Similarity:
     """Return the transformation that moves the N poses of the ``estimate`` onto the N poses of the ``reference``.
 
+    ``how`` is one of these. All but the first two minimize the sum of squared distances between the positions.
+
     - "none": the identity.
     - "origin": moves the first pose of the estimate to the first pose of the reference.
-    - "se2": the motion in the plane with the least sum of squared distances between the positions.
-    - "yaw": the same for a motion in space that turns only about the vertical.
-    - "se3": the same for any motion in space.
-    - "sim3": the same for any motion in space, with a scale.
+    - "se2": a rotation and translation in the plane.
+    - "yaw": a rotation about the vertical and a translation in space.
+    - "se3": a rotation and translation in space.
+    - "sim3": a rotation, translation and scale in space.
 
     Raises InputError if the poses do not determine the transformation.
     """
@@ -195,7 +198,7 @@ def _planar(estimate: PosePath, reference: PosePath, how: Alignment) -> Similari
 
 
 def _umeyama(estimate: PosePath, reference: PosePath, *, with_scale: bool) -> Similarity:
-    """Return the least-squares transformation in space, by the method of Umeyama. ``with_scale``: whether it has a scale."""
+    """Return the least-squares transformation in space by Umeyama's method. ``with_scale``: estimate a scale too."""
     centre, target = estimate.positions.mean(axis=0), reference.positions.mean(axis=0)
     a, b = estimate.positions - centre, reference.positions - target
     left, singular, right = np.linalg.svd(b.T @ a / len(a))

@@ -44,7 +44,7 @@ FILES = ("errors.csv", "report.html", "score.json")  # score.json is written las
 
 
 def _trajectories(score: TrajectoryScore) -> Figure:
-    """Plot both trajectories from above. Unless both are planar, also plot their heights."""
+    """Return a figure of both trajectories from above. Unless both are planar, it also shows their heights."""
     flat = score.estimate.is_planar and score.reference.is_planar
     places = np.concatenate((score.estimate.positions, score.reference.positions))[:, :2]
     width, depth = np.maximum(np.ptp(places, axis=0), 1e-6)
@@ -72,7 +72,7 @@ def _trajectories(score: TrajectoryScore) -> Figure:
 
 
 def _errors(score: TrajectoryScore) -> Figure:
-    """Plot the absolute and the relative errors over time, and the distribution of the absolute errors."""
+    """Return a figure of the errors of a comparison over time, and of the distribution of the absolute errors."""
     kinds = {"absolute": score.ape, "over 1 m of path": score.rpe_per_m, "over 1 s": score.rpe_per_s}
     kinds |= {f"over {delta}": errors for delta, errors in score.rpe.items()}
     known = {name: errors for name, errors in kinds.items() if errors is not None and len(errors.position)}
@@ -94,7 +94,7 @@ def _errors(score: TrajectoryScore) -> Figure:
 
 
 def _abscissa(score: TrajectoryScore) -> tuple[Array, str]:
-    """Return the abscissa (N,) of the plots and its label: times [s], or numbers of the poses if there are no timestamps."""
+    """Return the abscissa (N,) of the plots and its label: times [s], or numbers of poses without timestamps."""
     t = score.seconds()
     return (np.arange(1.0, len(score.estimate) + 1), "number of the pose") if t is None else (t, "time [s]")
 
@@ -113,7 +113,7 @@ def errors_table(score: TrajectoryScore) -> Rows:
 
 
 def extents(score: TrajectoryScore) -> dict[str, str]:
-    """Return descriptions of the estimate, the reference, their association, the pieces and the alignment, by title."""
+    """Return {title: description} of the estimate, the reference, their association, the pieces and the alignment."""
     rows = {}
     for name, path, poses, length in zip(
         ("estimate", "reference"), (score.estimate, score.reference), score.poses, score.lengths, strict=True
@@ -145,7 +145,7 @@ def page(score: TrajectoryScore) -> str:
 
 
 def _association(score: TrajectoryScore) -> str:
-    """Describe how poses were paired."""
+    """Return a description of how the poses of both trajectories were paired."""
     settings = score.settings
     if "max_diff" in settings:
         return f"nearest stamps, at most {settings['max_diff']:g} s apart"
@@ -155,7 +155,7 @@ def _association(score: TrajectoryScore) -> str:
 
 
 def _alignment(score: TrajectoryScore) -> str:
-    """Describe the alignment: its kind, translation, rotation vector and scale."""
+    """Return a description of the alignment: its kind, translation, rotation vector and scale."""
     how, transform = score.settings["align"], score.transform
     if how == "none":
         return "none"

@@ -48,7 +48,7 @@ class PoseErrors:
     ends: Integers
 
     def figures(self, name: str) -> dict[str, float | None]:
-        """Return the statistics of the errors by key, such as ``NAME.position_rmse``. They are None if there are no errors."""
+        """Return the statistics of the errors by key, such as ``NAME.position_rmse``. None if there are no errors."""
         figures: dict[str, float | None] = {}
         for what, values in (("position", self.position), ("rotation", self.rotation)):
             statistics = summarize(np.empty(0) if values is None else values)
@@ -61,11 +61,11 @@ class TrajectoryScore:
     """The result of the comparison of an estimated trajectory with a reference.
 
     ``estimate``, ``reference``: the N paired poses of both, after the alignment. ``transform``: the alignment, from the
-    frame of the estimate to the frame of the reference. ``ape``: N absolute errors.
-    ``rpe_per_m``, ``rpe_per_s``: relative errors over a metre of path and over a second, None without rotations or
-    timestamps. ``rpe``: relative errors over other distances and durations, by a text such as "5m".
-    ``lengths`` [m], ``poses``: length and number of poses of the whole estimate and of the whole reference.
-    ``settings``: the settings of association and alignment. ``warnings``: likely mistakes in the comparison.
+    frame of the estimate to the frame of the reference. ``ape``: N absolute errors. ``rpe_per_m``, ``rpe_per_s``:
+    relative errors over a metre of path and over a second, None without rotations or timestamps. ``rpe``: relative
+    errors over other distances and durations, by a text such as "5m". ``lengths`` [m], ``poses``: length and number of
+    poses of the whole estimate and of the whole reference. ``settings``: the settings of association and alignment.
+    ``warnings``: likely mistakes in the comparison.
     """
 
     estimate: PosePath
@@ -135,13 +135,13 @@ def score_paths(
     align_poses: int | None = None,
     delta: Sequence[str] = (),
 ) -> TrajectoryScore:
-    """Compare an estimated trajectory with a reference.
+    """Return the errors of an estimated trajectory against a reference.
 
-    ``align``: see :func:`~factorgraph_loc.evaluation.trajectories.association.alignment`. With "se2" heights are ignored.
-    ``associate_by``, ``max_diff``, ``max_gap``: see :func:`~factorgraph_loc.evaluation.trajectories.association.associate`.
-    ``all_pairs``: whether relative errors are over overlapping pieces, one from each pose, instead of successive pieces.
-    ``align_poses``: number of the first poses that determine the alignment, None for all.
-    ``delta``: further distances and durations of relative errors, such as "5m" or "2s".
+    ``align``: see :func:`~factorgraph_loc.evaluation.trajectories.association.alignment`. With "se2" heights are
+    ignored. ``associate_by``, ``max_diff`` [s], ``max_gap`` [s]: how poses are paired, see
+    :func:`~factorgraph_loc.evaluation.trajectories.association.associate`. ``all_pairs``: if true, relative errors are
+    over overlapping pieces, one from each pose, otherwise over successive pieces. ``align_poses``: number of the first
+    poses that determine the alignment, None for all. ``delta``: more lengths of relative errors, such as "5m" or "2s".
 
     Raises InputError if no poses can be paired, the poses do not determine the alignment, or an argument is invalid.
     """
@@ -185,7 +185,10 @@ def score_paths(
 def pose_errors(
     pair: Associated, *, all_pairs: bool = False
 ) -> tuple[PoseErrors, PoseErrors | None, PoseErrors | None]:
-    """Return the absolute errors, and the relative errors over a metre of path and over a second; see :class:`TrajectoryScore`."""
+    """Return the absolute errors, and the relative errors over a metre of path and over a second.
+
+    The relative errors may be None, see :func:`relative_errors`. ``all_pairs``: see :func:`score_paths`.
+    """
     estimate, truth = pair.estimate, pair.reference
     distance = np.linalg.norm(estimate.positions - truth.positions, axis=1)
     ape = PoseErrors(distance, None, np.arange(len(estimate)))
@@ -196,9 +199,9 @@ def pose_errors(
 
 
 def relative_errors(pair: Associated, length: float, unit: str, *, all_pairs: bool = False) -> PoseErrors | None:
-    """Return relative errors over pieces of a path. ``unit``: "m" for a ``length`` of path in metres, "s" for a time in seconds.
+    """Return relative errors over pieces of a path. None without rotations, or for "s" without timestamps.
 
-    Return None without rotations, or for "s" without timestamps.
+    ``unit``: "m" for a ``length`` of path in metres, "s" for a time in seconds. ``all_pairs``: see :func:`score_paths`.
     """
     estimate, truth = pair.estimate, pair.reference
     if not (estimate.has_rotations and truth.has_rotations):
@@ -213,7 +216,7 @@ def relative_errors(pair: Associated, length: float, unit: str, *, all_pairs: bo
 
 
 def _delta(text: str) -> tuple[float, str]:
-    """Parse a distance or duration such as "5m" or "0.5s". Return its number and unit. Raises InputError for other text."""
+    """Return the number and the unit of a distance or duration such as "5m". Raises InputError for other text."""
     try:
         length = float(text[:-1])
     except ValueError:
@@ -236,10 +239,10 @@ def _check(align: str, associate_by: str, max_diff: float, max_gap: float) -> No
 def _relative(
     estimate: PosePath, truth: PosePath, steps: Array, length: float, gaps: Integers, *, all_pairs: bool
 ) -> PoseErrors:
-    """Return the translation and rotation of ``Q^-1 P`` for each piece. Q is the motion of the reference over the
-    piece, and P the motion of the estimate.
+    """Return the translation and rotation of ``Q^-1 P`` for each piece of a path.
 
-    ``steps`` (N - 1,): distances or times between poses. ``length``: of a piece, in the same unit. No piece crosses ``gaps``.
+    Q is the motion of the reference over the piece, and P the motion of the estimate. ``steps`` (N - 1,): distances or
+    times between poses. ``length``: of a piece, in the same unit. No piece crosses ``gaps``.
     """
     cut = pairing.all_pairs if all_pairs else pairing.successive
     inner = np.unique(gaps[(gaps > 0) & (gaps < len(estimate))]).tolist()
@@ -252,8 +255,8 @@ def _relative(
 
 
 def _motions(path: PosePath, begins: Integers, ends: Integers) -> tuple[Array, Array]:
-    """Return rotations (K, 3, 3) and translations (K, 3) from the poses ``begins`` to ``ends``, in the frames of
-    ``begins``."""
+    """Return rotations (K, 3, 3) and translations (K, 3) from the poses with indices ``begins`` to ``ends``. They are
+    in the frames of the poses ``begins``."""
     back = path.rotations[begins].transpose(0, 2, 1)
     shifts = path.positions[ends] - path.positions[begins]
     return back @ path.rotations[ends], np.einsum("kij,kj->ki", back, shifts)
@@ -265,7 +268,7 @@ def _steps(path: PosePath) -> Array:
 
 
 def _angles(rotations: Array) -> Array:
-    """Return the angles (K,) [rad] of rotations (K, 3, 3). Sine and cosine are both used, which is accurate for all angles."""
+    """Return the angles (K,) [rad] of rotations (K, 3, 3). Use of sine and cosine makes all angles accurate."""
     sine = np.linalg.norm(rotations - rotations.transpose(0, 2, 1), axis=(1, 2)) / np.sqrt(8.0)
     cosine = (np.trace(rotations, axis1=1, axis2=2) - 1.0) / 2.0
     return np.asarray(np.arctan2(sine, cosine))
@@ -281,8 +284,8 @@ def _seconds(estimate: PosePath, truth: PosePath) -> Array | None:
 def _height_warnings(
     estimate: PosePath, reference: PosePath, associate_by: Association, align: Alignment
 ) -> list[Notice]:
-    """Return warnings about heights: if they vary although ``align`` ignores them, or if a planar trajectory is
-    compared with one at other heights."""
+    """Return warnings about heights that vary although ``align`` ignores them. Also return a warning if a planar
+    trajectory is compared with a trajectory at other heights."""
     if align == "se2":
         rises = [(path.name, float(np.ptp(path.positions[:, 2]))) for path in (estimate, reference)]
         sentence = "{path}: z varies by {rise:.1f} m and is ignored: check that its z axis points up"
