@@ -52,12 +52,13 @@ def bundled(
     poses: Sequence[Array],
     waiting: Waiting,
 ) -> list[tuple[Array, Array]] | None:
-    """Adjust the last keyframes and their points. Returns the pose (3,) and the tilt (2,) of each adjusted keyframe.
+    """Bundle adjustment of the last keyframes and their points. Returns a list of (pose (3,), tilt (2,)), one per
+    adjusted keyframe.
 
-    ``keyframes``: consecutive keyframes. The longest sequence of newest keyframes is adjusted in which each shares
-    enough points with its predecessor. The first adjusted pose is fixed. ``poses``: the initial poses of the keyframes.
-    ``waiting``: the sightings of each point. Returns None if there are fewer than :data:`ENOUGH` points, or if most
-    sightings of a keyframe do not fit.
+    ``keyframes``: consecutive keyframes. The newest keyframes are adjusted, as long as each shares enough points with
+    its predecessor. The first adjusted pose is fixed. ``poses``: the initial poses of all ``keyframes``. ``waiting``:
+    the observations of each point. A tilt is roll and pitch [rad]. Returns None if there are fewer than :data:`ENOUGH`
+    points, or if most observations of a keyframe do not fit.
     """
     often = _seen_often(keyframes[0].index, waiting)
     shared, sees = np.zeros(len(keyframes)), np.zeros(len(keyframes))
@@ -86,8 +87,9 @@ def bundled(
 def _adjusted(
     model: CameraModel, keyframes: Sequence[Keyframe], poses: Sequence[Array], often: Sequence[Sequence[PointSighting]]
 ) -> tuple[Sequence[Array], Array, Truths]:
-    """Return adjusted poses (3,) and tilts (N, 2) of N keyframes, and a mask (M,) of the sightings that fit the result.
-    ``often``: the sightings of each point, M in all. If the adjustment fails, poses and tilts are the initial ones."""
+    """Return adjusted poses (3,) and tilts (N, 2) of N keyframes, and a mask (M,) of the observations that fit them.
+    ``often``: the observations of each point, M in all. If the adjustment fails, poses and tilts are the initial
+    ones."""
     first = keyframes[0].index
     places = [camera_pose(model, pose) for pose in poses]
     points = []
@@ -132,7 +134,7 @@ class LocalBundle:
         return linear
 
     def cost(self, state: State) -> float:
-        """Return the robust cost at ``state``: half the sum of squared whitened residuals, with Huber losses of the pixels."""
+        """Return the robust cost at ``state``: half the sum of squared whitened residuals, Huber losses for pixels."""
         poses, tilts, _ = state
         of_pixels = huber_loss(self.linearize(state)[2], self.model.robust).sum()
         return float(of_pixels + 0.5 * np.sum(tilts**2) / self.model.tilt**2) + self.odometry.cost(poses, np.zeros(0))
@@ -182,18 +184,18 @@ class LocalBundle:
 
 
 def _seen_often(first: int, waiting: Waiting) -> list[list[PointSighting]]:
-    """Return the sightings of each point from the keyframe with number ``first`` and later ones. Points with fewer than
-    :data:`FEWEST` of these are omitted. ``waiting``: all sightings of each point that is not yet triangulated."""
+    """Return the observations of each point from keyframe number ``first`` and later ones. Points with fewer than
+    :data:`FEWEST` of these are left out. ``waiting``: all observations of each point that is not yet triangulated."""
     return [sightings for w in waiting.values() if len(sightings := [s for s in w if s.keyframe >= first]) >= FEWEST]
 
 
 def _turned(
     model: CameraModel, poses: Sequence[Array], first: int, often: Sequence[Sequence[PointSighting]]
 ) -> list[Array]:
-    """Correct the rotations between the ``poses`` (3,) of consecutive keyframes, and return the corrected poses.
+    """Return the ``poses`` (3,) of consecutive keyframes with corrected rotations between them.
 
     The median change of bearing of the common points in both images replaces a rotation that differs by more than
-    :data:`SLIPPED`. ``first``: the number of the first keyframe. ``often``: the sightings of each point.
+    :data:`SLIPPED`. ``first``: the number of the first keyframe. ``often``: the observations of each point.
     """
     sides: list[dict[int, float]] = [{} for _ in poses]
     for i, sightings in enumerate(often):
@@ -211,11 +213,11 @@ def _turned(
 
 
 class KeyframeCameras:
-    """Computes the camera poses of keyframes of a graph. The caller triangulates points with these poses.
+    """Computes the camera poses of a graph's keyframes, so that points can be triangulated.
 
-    ``estimated``: the estimated constants of the camera. ``twists``: the velocity (3,) of the robot at each keyframe,
-    by number of the keyframe; empty if the time offset of the camera is not estimated. ``anchored``, by number of the
-    keyframe: True if visible points of the graph determine the keyframe's pose.
+    ``estimated``: the estimated constants of the camera. ``twists``: the velocity (3,) of the robot, by number of the
+    keyframe. It is empty if the time offset of the camera is not estimated. ``anchored``: by number of the keyframe,
+    True if visible points of the graph determine the keyframe's pose.
     """
 
     def __init__(self, model: CameraModel, estimated: Estimated) -> None:
@@ -225,12 +227,12 @@ class KeyframeCameras:
         self.anchored: dict[int, bool] = {}
 
     def add(self, keyframe: Keyframe, graph: Graph) -> None:
-        """Store the data of a new keyframe. Call this while ``graph`` still stores the odometry at its time."""
+        """Store the velocity at a new keyframe. Call this before ``graph`` deletes the odometry at its time."""
         if self._offset is not None:
             self.twists[keyframe.index] = graph.motion.twist(keyframe.t)
 
     def anchor(self, keyframe: Keyframe, points: int) -> None:
-        """Store whether points of the graph determine a keyframe's pose. ``points``: how many the keyframe observes."""
+        """Store whether points of the graph determine a keyframe's pose. ``points``: the number of observed points."""
         self.anchored[keyframe.index] = points >= ANCHORED
 
     def forget(self, first: int) -> None:
@@ -239,17 +241,17 @@ class KeyframeCameras:
         self.anchored = {number: anchored for number, anchored in self.anchored.items() if number >= first}
 
     def at_image(self, keyframe: int, guess: Guess, graph: Graph) -> Guess:
-        """Return the pose when the image was taken, from the pose ``guess`` at the image's time stamp. The variance of
-        the camera's time offset is added. ``keyframe``: the number of the image's keyframe."""
+        """Return pose and covariance at an image's time of exposure. ``guess``: pose and covariance at the image's time
+        stamp. ``keyframe``: the number of the image's keyframe. The variance of the camera's time offset is added."""
         return self._moved(keyframe, guess, graph, 1.0)
 
     def at_stamp(self, keyframe: int, guess: Guess, graph: Graph) -> Guess:
-        """Return the pose at the image's time stamp, from the pose ``guess`` when the image was taken (the camera's
-        time offset later). ``keyframe``: the number of the image's keyframe."""
+        """Return the pose and covariance at the time stamp of an image, the inverse of :meth:`at_image`. ``guess``:
+        pose and covariance at the time of exposure. ``keyframe``: the number of the image's keyframe."""
         return self._moved(keyframe, guess, graph, -1.0)
 
     def pose(self, keyframe: int, graph: Graph) -> Array:
-        """Return the estimated pose (3,) of the keyframe with this number, at the time when its image was taken."""
+        """Return the estimated pose (3,) of the keyframe with this number, at the time of exposure of its image."""
         pose = graph.current(graph.keyframes[keyframe].key)
         return self._moved(keyframe, (pose, np.zeros((3, 3))), graph, 1.0)[0]
 
@@ -267,10 +269,10 @@ class KeyframeCameras:
     def cameras(
         self, newest: Keyframe, pose: Array, names: Iterable[Hashable], waiting: Waiting, graph: Graph
     ) -> dict[int, KeyframeCamera]:
-        """Return the camera poses, by number, of the keyframes that observe the points ``names``.
+        """Return the camera poses, by number, of all keyframes that observe one of the points ``names``.
 
-        ``newest``: the newest keyframe, which is at ``pose`` (3,). ``waiting``: the sightings of each point. The
-        ``slack`` of each camera pose is its error relative to the newest camera pose, in pixels. The error is small if
+        ``newest``: the newest keyframe, which is at ``pose`` (3,). ``waiting``: the observations of each point. The
+        ``slack`` of a camera pose is its error relative to the newest camera pose, in pixels. The error is small if
         points of the graph determine both keyframes. Otherwise it is computed from the covariance of the odometry.
         """
         slacks = self._slacks(newest, graph)
@@ -285,9 +287,9 @@ class KeyframeCameras:
     ) -> tuple[dict[int, KeyframeCamera], Array] | None:
         """Return the adjusted camera poses of the last keyframes, by number, and the adjusted pose (3,) of ``newest``.
 
-        ``newest``: the newest keyframe, with the initial pose ``pose`` (3,). ``waiting``: the sightings of the points
-        that are adjusted with the poses. ``tilt``: standard deviation [rad] of the robot's roll and pitch. Returns None
-        if points of the graph determine the pose of ``newest`` already, or if the adjustment fails.
+        ``newest``: the newest keyframe, with the initial pose ``pose`` (3,). ``waiting``: the observations of the
+        points that are adjusted with the poses. ``tilt``: standard deviation [rad] of the robot's roll and pitch.
+        Returns None if points of the graph determine the pose of ``newest`` already, or if the adjustment fails.
         """
         if self.anchored[newest.index]:
             return None

@@ -43,8 +43,9 @@ FARTHEST = 15.0  # m: largest distance of a point that is searched
 class OldPoints:
     """N points of the graph that were last observed long ago.
 
-    ``points``: the positions, which may be outdated, with the descriptor of one view of each point. ``keys``: the graph
-    variable of each point. ``travelled`` (N,): the path length of the robot [m] at the last observation of each point.
+    ``points``: the positions, which may be outdated, with the descriptor of one view of each point. ``keys``: the
+    points' keys in the graph. ``travelled`` (N,): the path length of the robot [m] at the last observation of each
+    point.
     """
 
     points: PointMap
@@ -68,7 +69,7 @@ class Image:
 
 @dataclass(frozen=True)
 class Revisit:
-    """A keyframe whose image shows old points.
+    """A keyframe whose image shows points that were last observed long ago ("old" points).
 
     ``pose`` (3,): the keyframe's pose, computed from these points. ``points`` (M,): indices of the recognized old
     points. ``features`` (M,): indices of the matching features of the image.
@@ -81,20 +82,20 @@ class Revisit:
 
 
 class LoopClosure:
-    """Detector of loop closures. It requires that several consecutive images show old points, from consistent poses."""
+    """Detector of loop closures: several consecutive images must show points of long ago, from consistent poses."""
 
     def __init__(self) -> None:
         self._agreeing: list[Revisit] = []  # revisits of the last consecutive images, which agree with each other
         self._last_time = -math.inf  # s; the time of the last image that was compared
 
     def is_due(self, t: float) -> bool:
-        """True if an image at time ``t`` [s] must be compared: at least :data:`INTERVAL` after the last comparison."""
+        """Return True if at least :data:`INTERVAL` has passed at ``t`` [s] since the last comparison of an image."""
         return t >= self._last_time + INTERVAL
 
     def compare(
         self, model: CameraModel, image: Image, old: OldPoints, current: Callable[[int], Array]
     ) -> Revisit | None:
-        """Compare an image with the ``old`` points, and return the revisit if a loop is closed, otherwise None.
+        """Compare an image with ``old`` points. Returns the recognized points and the pose, None if no loop is closed.
 
         A loop is closed if the last :data:`SUCCESSIVE` images show old points from consistent poses. ``current``: a
         function that returns the newest estimate of a variable of the graph, by key.
@@ -114,7 +115,7 @@ class LoopClosure:
 
 
 def _revisit(model: CameraModel, image: Image, old: OldPoints, current: Callable[[int], Array]) -> Revisit | None:
-    """Return the old points that one image shows, None if too few. Arguments: see :meth:`LoopClosure.compare`."""
+    """Return the old points that one image shows, None if too few. For arguments see :meth:`LoopClosure.compare`."""
     near = np.flatnonzero(_in_reach(model, lifted(model, *image.guess), old.points))
     recognised = None if len(near) < FEWEST else _recognised(model, image.frame, _newest(old, near, current))
     if recognised is None:
@@ -157,7 +158,7 @@ def _on_floor(
 
 
 def _is_plausible(guess: Guess, pose: Array, travelled: float) -> bool:
-    """True if the drift over a path of length ``travelled`` [m] can explain the difference between ``pose`` (3,) and
+    """Return True if drift over a path of length ``travelled`` [m] explains the difference between ``pose`` (3,) and
     the estimated pose ``guess``."""
     off = se2.log(se2.between(guess[0], pose))
     drift = DRIFT + DRIFT_PER_METRE * travelled
@@ -186,14 +187,14 @@ def _in_reach(model: CameraModel, camera: CameraPose, points: PointMap) -> Truth
 
 
 def _newest(old: OldPoints, rows: Integers, current: Callable[[int], Array]) -> PointMap:
-    """Return the ``old`` points with the indices ``rows`` at their newest positions, which ``current(key)`` returns.
-    The camera positions of their views are shifted by the same amount."""
+    """Return the ``old`` points with the indices ``rows``, moved to their newest estimates. ``current``: returns the
+    estimate of a point by key. The camera positions of the views are shifted by the same amount."""
     points = old.points.chosen(rows)
     positions = np.array([current(old.keys[i]) for i in rows.tolist()])
     return replace(points, positions=positions, seen_from=points.seen_from + positions - points.positions)
 
 
 def _is_spread_out(model: CameraModel, pixels: Array) -> bool:
-    """True if ``pixels`` (K, 2) are in at least :data:`CELLS` cells of a grid over the image."""
+    """Return True if ``pixels`` (K, 2) are in at least :data:`CELLS` cells of a grid over the image."""
     cells = np.floor(pixels / (model.width, model.height) * GRID)
     return len(np.unique(cells, axis=0)) >= CELLS

@@ -74,10 +74,10 @@ LARGEST_SIGMA = 0.5  # m, rad: standard deviations beyond which the pose is unkn
 class UpdateRecord:
     """The state of the robot after an update of the filter. The final trajectory is made from these records.
 
-    ``t`` [s]: the time of the update. ``step``: the prediction from the previous record to this one. ``robot``,
-    ``constants`` (P,): the state of the robot and the corrections of the odometry's constants after the update.
-    ``covariance`` (12 + P, 12 + P): the covariance of the errors of ``robot`` and ``constants``.
-    ``relocalized``: True if the pose comes from the image alone and is independent of the previous record.
+    ``t`` [s]: the time of the update. ``step``: the prediction from the previous record to this one. ``robot``: the
+    state of the robot. ``constants`` (P,): the estimated corrections of the odometry's constants. ``covariance`` (12 +
+    P, 12 + P): the covariance of the errors of ``robot`` and ``constants``. ``relocalized``: True if the pose comes
+    from the image alone and is independent of the previous record.
     """
 
     t: float
@@ -89,8 +89,8 @@ class UpdateRecord:
 
 
 def smoothed(records: Sequence[UpdateRecord]) -> list[UpdateRecord]:
-    """Smooth each record with all later records (Rauch, Tung, Striebel, 1965), and return the smoothed records.
-    Velocity and turn rate do not influence later records and are not smoothed."""
+    """Return each record smoothed with all later records (Rauch, Tung, Striebel, 1965). Velocity and turn rate are not
+    smoothed."""
     results = list(records[-1:])
     for next_record, record in zip(records[:0:-1], records[-2::-1], strict=True):
         results.append(record if next_record.relocalized else _smoothed(record, next_record, results[-1]))
@@ -98,7 +98,7 @@ def smoothed(records: Sequence[UpdateRecord]) -> list[UpdateRecord]:
 
 
 def _smoothed(record: UpdateRecord, next_record: UpdateRecord, later: UpdateRecord) -> UpdateRecord:
-    """Return ``record``, smoothed with ``later``, which is the smoothed ``next_record``."""
+    """Return ``record``, smoothed with the next record. ``later``: the smoothed ``next_record``."""
     total, known = len(record.covariance), next_record.step.transition.shape[1]
     transition = np.zeros((POSE, total))
     transition[:, :known] = next_record.step.transition[:POSE]
@@ -161,15 +161,15 @@ class Monoslam(Filter):
         self._origin: Origin | None = None
 
     def initialize(self, prior: PosePrior) -> None:
-        """Start from the Gaussian ``prior``. If its heading is unknown, start from the first image that is located in the map."""
+        """Start from the Gaussian ``prior``, or at the first image that determines the pose if it has no heading."""
         if prior.has_heading:
             super().initialize(prior)
         else:
             self._wait(prior.t)
 
     def learnt(self) -> Learnt:
-        """Return the estimated constants of the odometry, and x and y of the points in the state. Points of unknown
-        depth are left out."""
+        """Return the estimated constants of the odometry, and x and y of the points that the filter estimates. Points
+        of unknown depth are left out."""
         state: SlamState | None = self._state
         if state is None:
             return Learnt()
@@ -187,8 +187,8 @@ class Monoslam(Filter):
         return Learnt(values, points)
 
     def trajectory(self) -> Trajectory:
-        """Return the planar poses at the times at which a run records the pose. In a known map, the poses are smoothed
-        with later images unless the setting ``smooth`` is off. If points are estimated, the poses are not smoothed."""
+        """Return the planar poses at the times at which the run recorded the pose. In a known map they are smoothed
+        with later images, unless ``smooth`` is off. If points are estimated, they are not smoothed."""
         is_known = self._settings.landmarks == "known"
         records = smoothed(self._records) if self._smooth and is_known else self._records
         ticks = np.unique(np.array(self._ticks))
@@ -246,7 +246,7 @@ class Monoslam(Filter):
         self._state = replace(state, image_odometry=self._odometry)
 
     def _match(self, m: Pixels, state: SlamState, eye: Eye) -> tuple[SlamState, Match]:
-        """Match the image ``m`` with the points. Returns the predicted state and the matches. If points are estimated
+        """Match the pixels of ``m`` with points. Returns the predicted state and the matches. If points are estimated
         and the image shows that the wheels slipped, the returned state has a larger covariance."""
         if self._settings.landmarks == "known" or state.image_odometry is None:
             return state, self._matcher.match(m, state, eye)
@@ -305,12 +305,12 @@ class Monoslam(Filter):
         return relocated, True
 
     def _is_vague(self, state: SlamState) -> bool:
-        """True if the map is known and the pose is too uncertain for a Kalman update, which linearizes at the pose."""
+        """Return True if the map is known and the pose is too uncertain for the linearisation of a Kalman update."""
         return self._settings.landmarks == "known" and bool(np.diag(state.covariance)[:6].max() > LARGEST_SIGMA**2)
 
     def _standing(self, camera: CameraPose, eye: Eye, lost_state: SlamState) -> SlamState | None:
-        """Return the state of a robot at a relocalized ``camera`` pose, None if this robot is not level on the floor.
-        ``lost_state``: the state before, which supplies the odometry's constants."""
+        """Return the state of a robot at a relocalized ``camera`` pose. Returns None if this robot would not be level
+        on the floor. ``lost_state``: the state before, with the odometry's constants."""
         s = self._settings
         position, rotation = carrier(eye.model, camera.position, camera.rotation)
         robot = RobotState(position, rotation, np.zeros(3), np.zeros(3))

@@ -21,8 +21,8 @@ def carried(prior: SlamState, posterior: SlamState, scale: int | None) -> Array:
     directions. It is the covariance after an update in the invariant error state (see the module docstring).
 
     ``prior``: the state before the update. ``posterior``: the state after an ordinary update, with its covariance.
-    ``scale``: the index of the odometry's constant that scales distances, or None if this constant is not estimated.
-    P is the number of constants of the odometry, and D the number of values of points.
+    ``scale``: the index of the odometry's constant that scales distances, or None if this constant is not estimated. P
+    is the number of constants of the odometry, and D the number of values of points.
     """
     covariance = posterior.covariance
     own, ours = prior.robot, posterior.robot

@@ -20,7 +20,7 @@ FEWEST_TRIALS, LEAST_FOUND = 8, 0.5
 
 
 def with_point(state: SlamState, point: MapPoint, eye: Eye, pixel: Array) -> SlamState:
-    """Return the state with a new ``point``, which the camera observes at ``pixel`` (2,)."""
+    """Return the state with a new ``point``, which the camera ``eye`` observes at ``pixel`` (2,)."""
     position, rotation = eye.pose(state.robot)
     ray, by_camera, by_seen = inverse_depth.begin(eye.model, position, rotation, pixel, INVERSE_DEPTH)
     by_pose = by_camera @ eye.lift
@@ -37,8 +37,8 @@ def with_point(state: SlamState, point: MapPoint, eye: Eye, pixel: Array) -> Sla
 
 
 def settled(state: SlamState, eye: Eye) -> SlamState:
-    """Convert points from inverse depth to x, y, z if their depth is certain enough. Returns the new state.
-    The criterion is the linearity index of Civera, Davison and Montiel (2008)."""
+    """Return the state with points of certain depth converted from inverse depth to x, y, z. ``eye``: the camera. The
+    criterion is the linearity index of Civera, Davison and Montiel (2008)."""
     position, _ = eye.pose(state.robot)
     rays = [i for i, p in enumerate(state.points) if p.ray]
     if not rays:
@@ -65,7 +65,7 @@ def settled(state: SlamState, eye: Eye) -> SlamState:
 
 
 def counted(state: SlamState, expected: Sequence[int], matched: Collection[int], t: float) -> SlamState:
-    """Return the state with the matches of an image at time ``t`` [s] counted in its points. ``expected``: indices of
+    """Return the state with updated counters of its points, after an image at time ``t`` [s]. ``expected``: indices of
     the points that should be visible. ``matched``: indices of the points that were matched."""
     points = list(state.points)
     for i in expected:
@@ -94,7 +94,7 @@ def pruned(state: SlamState, most: int) -> tuple[SlamState, int]:
 
 
 def _is_beyond_infinity(state: SlamState, place: int) -> bool:
-    """True if the inverse depth at index ``place`` of ``state.values`` is below zero by more than two standard deviations."""
+    """Return True if the inverse depth ``state.values[place]`` is below zero by more than two standard deviations."""
     return bool(state.values[place] < -2.0 * np.sqrt(state.covariance[state.base + place, state.base + place]))
 
 

@@ -87,7 +87,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Origin:
-    """The start of a run without a map. Its uncertainty is not part of the state, but is added to estimates.
+    """The start of a run without a map. Its uncertainty is not in the filter's state, but is added to estimates.
 
     ``robot``: the state at the start. ``covariance`` (6, 6): the covariance of the start pose, in the robot's frame.
     """
@@ -96,7 +96,7 @@ class Origin:
     covariance: Array
 
     def of_pose(self, robot: RobotState) -> Array:
-        """Return the part of the covariance (6, 6) of the later pose in ``robot`` that comes from the uncertain start pose."""
+        """Return the covariance (6, 6) that the uncertain start pose adds to the later pose in ``robot``."""
         turn = robot.rotation.T @ self.robot.rotation
         back = robot.rotation.T @ (self.robot.position - robot.position)
         adjoint = np.zeros((6, 6))
@@ -105,20 +105,19 @@ class Origin:
         return np.asarray(adjoint @ self.covariance @ adjoint.T)
 
     def of_point(self, point: Array) -> Array:
-        """Return the part of the covariance (3, 3) of a ``point`` (3,) in the world frame that comes from the uncertain
-        start pose."""
+        """Return the covariance (3, 3) that the uncertain start pose adds to a ``point`` (3,) in the world frame."""
         rotation = self.robot.rotation
         jacobian = rotation @ np.column_stack((-cross(rotation.T @ (point - self.robot.position)), np.eye(3)))
         return np.asarray(jacobian @ self.covariance @ jacobian.T)
 
 
 def standstill(robot: RobotState) -> Step:
-    """Return the step of a robot that does not move, for two measurements at the same time."""
+    """Return a prediction step without motion. It is used between two measurements at the same time."""
     return Step(robot, np.eye(ROBOT), np.zeros((ROBOT, ROBOT)))
 
 
 def measured(robot: RobotState, delta: Array, covariance: Array, by_constants: Array, dt: float) -> Step:
-    """Return the step of a robot that moves as measured by odometry, with the velocity and turn rate of the odometry.
+    """Return the prediction step of a robot that moves as measured by odometry, with the odometry's velocity.
 
     ``robot``: the state at the start. ``delta`` (3,): pose of the end in the frame of the start, as x [m], y [m],
     heading [rad]. ``covariance`` (3, 3): of a perturbation of the end in its own frame. ``by_constants`` (3, P): the
@@ -141,8 +140,8 @@ def measured(robot: RobotState, delta: Array, covariance: Array, by_constants: A
 
 
 def on_the_floor(step: Step, dt: float, height_sigma: float, tilt_sigma: float, settling: float) -> Step:
-    """Return ``step`` followed by a decay of height, roll and pitch towards zero, for a robot on a floor with small
-    tilts.
+    """Return the prediction ``step`` followed by a decay of height, roll and pitch towards zero. Use it if a robot on a
+    floor tilts only slightly.
 
     Height, roll and pitch are a stationary process with mean zero and without velocity. ``height_sigma`` [m] and
     ``tilt_sigma`` [rad] are its standard deviations, ``settling`` [s] its time constant. ``dt`` [s]: duration of
@@ -210,5 +209,5 @@ def cross(v: Array) -> Array:
 
 
 def orthonormal(rotation: Array) -> Array:
-    """Return a rotation (3, 3) with the accumulated rounding errors removed."""
+    """Return the orthonormal matrix nearest to a ``rotation`` (3, 3) with rounding errors."""
     return np.asarray(rotation @ (1.5 * np.eye(3) - 0.5 * rotation.T @ rotation))

@@ -39,10 +39,10 @@ FEWEST_MATCHES = 3  # with fewer matches, none is rejected
 
 
 def agreeing(residual: Array, innovation: Innovation, noise: Array) -> Truths:
-    """Return a mask (K,) of the matches that are inliers. With fewer than :data:`FEWEST_MATCHES` matches, all are inliers.
+    """Return a mask (K,) of the matches that are inliers. If K is below :data:`FEWEST_MATCHES`, all are inliers.
 
-    ``residual`` (K, 2) [px]: measured minus predicted pixels. ``innovation``: their covariance without noise. ``noise``
-    (K, 2, 2) [px^2]: the covariances of the pixel noise.
+    ``residual`` (K, 2) [px]: measured minus predicted pixels. ``innovation``: the covariance of the predicted pixels.
+    ``noise`` (K, 2, 2) [px^2]: the covariances of the pixel noise.
     """
     count = len(residual)
     right = np.ones(count, dtype=bool)
@@ -98,7 +98,7 @@ def _confirmed(residual: Array, total: Array, right: Truths) -> Truths:
 
 @dataclass(frozen=True)
 class Match:
-    """The inlier matches of an image: M points of the state and then P points of the map.
+    """The inlier matches of an image: M points of the filter's state, then P points of the known map.
 
     ``pixels`` (M + P, 2): the matched pixels. ``mapped``: indices of the M points of the state. ``points`` (P, 3):
     positions of the P points of the map. ``covariances`` (P, 3, 3): of these positions, None if negligible. ``taken``:
@@ -142,13 +142,14 @@ class FeatureMatcher:
             self._has_uncertain_points = worst > (EXACT * self.eye.model.sigma / self.eye.model.fx) ** 2
 
     def match(self, m: Pixels, state: SlamState, eye: Eye) -> Match:
-        """Return the matches of a measurement. Outliers are removed and counted as rejected."""
+        """Return the matches of the measurement ``m`` at the predicted ``state``. ``eye``: the camera. Outliers are
+        removed and counted as rejected."""
         return self._named(m, m.names, state, eye) if m.frame is None else self._searched(m.frame, state, eye)
 
     def unless_slipped(
         self, m: Pixels, state: SlamState, eye: Eye, added: Array, rarity: float
     ) -> tuple[SlamState, Match]:
-        """Return the state and its matches (:meth:`match`). The state's covariance is increased if the wheels slipped.
+        """Return the state, with a larger covariance if the wheels slipped, and the result of :meth:`match`.
 
         ``added`` (3, 3): the covariance of x, y and heading that slip adds. ``rarity``: minus the logarithm of the
         probability of slip. The wheels slipped if the log-likelihood ratio of the pixels exceeds ``rarity``.
@@ -167,8 +168,8 @@ class FeatureMatcher:
     def new(self, m: Pixels, state: SlamState, eye: Eye, match: Match, tracks: frozenset[int]) -> list[int]:
         """Return the indices of features or named pixels of the image ``m`` that may become new points of the state.
 
-        A feature qualifies if it is not matched, belongs to ``tracks`` (of the previous image), and is far enough from
-        matched and predicted pixels. A named pixel qualifies if its name is neither in the map nor in the state.
+        A feature qualifies if it is not matched, belongs to one of the feature ``tracks``, and is far from matched and
+        predicted pixels. A named pixel qualifies if its name is neither in the map nor in the state.
         """
         if m.frame is None:
             known_names = {p.name for p in state.points}
@@ -184,7 +185,7 @@ class FeatureMatcher:
         return chosen
 
     def in_view(self, state: SlamState, eye: Eye, since: float) -> int:
-        """Return the number of points of the state that should be visible and were last matched at ``since`` [s] or later."""
+        """Return the number of points of the state that should be visible, and were matched since ``since`` [s]."""
         lately = [i for i, p in enumerate(state.points) if p.t >= since]
         return len(_visible(eye, eye.mapped(state, lately))[1])
 
@@ -218,8 +219,8 @@ class FeatureMatcher:
         return replace(self._match(m.pixels, outside, known, which, wanted), tempering=eye.model.tempering)
 
     def relocated(self, m: Pixels, eye: Eye) -> CameraPose | None:
-        """Return the camera pose, computed from this image and the map without a prediction. Returns None if it is not
-        determined."""
+        """Return the camera pose, computed only from the image ``m`` and the map. Returns None if they do not determine
+        it. ``eye``: the camera."""
         if m.frame is not None:
             relocated = None if self._associator is None else self._associator.relocalized(m.frame)
             return None if relocated is None else relocated[0]
@@ -233,7 +234,7 @@ class FeatureMatcher:
         return place.camera
 
     def _known(self, m: CameraFrame, state: SlamState, eye: Eye) -> tuple[list[tuple[int, int]], int]:
-        """Return pairs (feature, point of the map) that match, and the number of map points that should be matched."""
+        """Return matching pairs (index of a feature, index of a map point), and the number of pairs to expect."""
         if self._associator is None:
             if not self._grows:
                 self._diagnostics.ignore("camera", len(m.pixels))
@@ -303,7 +304,7 @@ class FeatureMatcher:
 
 
 def _visible(eye: Eye, sights: Sights) -> tuple[Sights, Integers]:
-    """Return the predicted pixels of the points in front of the camera and inside its image, and their indices in ``sights``."""
+    """Return the elements of ``sights`` with a point in front of the camera and inside its image, and their indices."""
     inside = np.flatnonzero((sights.depths > 0.0) & eye.model.contains(sights.pixels))
     return sights[inside], inside
 

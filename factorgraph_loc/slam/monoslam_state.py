@@ -42,11 +42,11 @@ VELOCITY_SIGMA, RATE_SIGMA = 0.5, 0.5  # m/s, rad/s: standard deviations at the 
 
 @dataclass(frozen=True)
 class MapPoint:
-    """A point in the state of the filter. Its values are in :class:`SlamState`.
+    """A point in the state of the filter. Its coordinates are in ``values`` of :class:`SlamState`.
 
-    ``ray``: True if the point has six values (inverse depth), False if it has three (x, y, z).
-    ``descriptor``: the descriptor of a feature, None for a point with a name only. ``t`` [s]: the last time it was matched.
-    ``expected``, ``matched``: the number of images with an expected match, and with a match.
+    ``ray``: True if the point has six values (inverse depth), False if it has three (x, y, z). ``descriptor``: the
+    descriptor of a feature, None for a point with a name only. ``t`` [s]: the last time it was matched. ``expected``,
+    ``matched``: the number of images with an expected match, and with a match.
     """
 
     name: str
@@ -103,8 +103,8 @@ class SlamState:
         )
 
     def sway(self, usual: float) -> tuple[float, float]:
-        """Return the standard deviation of the tilt [rad] and its time constant [s]. ``usual``: the standard deviation
-        if none is estimated."""
+        """Return the standard deviation of roll and pitch [rad], and the time constant [s] of their change. ``usual``:
+        the standard deviation if none is estimated."""
         return (usual, SETTLING) if self.floor is None else (self.floor.sigma, UNEVEN)
 
     def widened(self, planar: Array) -> SlamState:
@@ -114,12 +114,12 @@ class SlamState:
         return replace(self, covariance=covariance)
 
     def moved(self, step: Step) -> SlamState:
-        """Return the state after the prediction ``step``. The points do not move."""
+        """Return the state after the prediction ``step``. Points keep their positions."""
         return replace(self, robot=step.robot, covariance=step.carried(self.covariance))
 
 
 def with_floor(prior: SlamState, posterior: SlamState, t: float) -> SlamState:
-    """Return the state ``posterior`` with an updated standard deviation of the robot's tilt (field ``floor``).
+    """Return ``posterior`` with an updated estimate ``floor`` of the standard deviation of the robot's tilt.
 
     ``prior``, ``posterior``: the states before and after the update by an image at time ``t`` [s]. The new value is
     estimated from the change of the tilt since the previous image.
@@ -204,7 +204,7 @@ class Eye:
         return mounted(self.model, robot.position, robot.rotation)
 
     def predicted(self, state: SlamState) -> CameraPose:
-        """Return the predicted pose of the camera with its covariance."""
+        """Return the pose of the camera with its covariance, computed from the ``state`` of the robot."""
         return CameraPose(*self.pose(state.robot), self.lift @ state.covariance[:POSE, :POSE] @ self.lift.T)
 
     def known(self, robot: RobotState, points: Array, covariances: Array | None) -> Sights:
@@ -256,9 +256,9 @@ class Eye:
 class Innovation:
     """The covariance of K predicted pixels in a Kalman update.
 
-    ``carried`` (12 + P + D, 2K): the covariance between the error state and the predicted pixels.
-    ``jacobian`` (2K, C), ``columns`` (C,): the Jacobian of the pixels, and the indices of its columns in the error
-    state. ``covariance`` (2K, 2K) [px^2]: the covariance of the predicted pixels, without pixel noise.
+    ``carried`` (12 + P + D, 2K): the covariance between the error state and the predicted pixels. ``jacobian`` (2K, C):
+    the Jacobian of the pixels by C components of the error state. ``columns`` (C,): the indices of these components.
+    ``covariance`` (2K, 2K) [px^2]: the covariance of the predicted pixels, without pixel noise.
     """
 
     carried: Array
@@ -291,7 +291,7 @@ class Innovation:
         return positive.root(self.total(noise))
 
     def gain(self, noise: Array) -> tuple[Array, Array]:
-        """Return the factors L and M of the Kalman gain, which is M.T @ inv(L). L: the Cholesky factor (2K, 2K) of the
+        """Return L and M, two factors of the Kalman gain M.T @ inv(L). L: the Cholesky factor (2K, 2K) of the
         innovation covariance with ``noise`` (K, 2, 2). M: inv(L) @ carried.T."""
         root = self.root(noise)
         return root, np.asarray(solve_triangular(root, self.carried.T, lower=True, check_finite=False))
@@ -312,9 +312,10 @@ def starting(sigmas: Array) -> Array:
 
 
 def widened(noise: Array, residual: Array, innovation: Innovation) -> Array:
-    """Return ``noise`` (K, 2, 2) with larger covariances for the pixels outside the gate of the innovation.
+    """Return ``noise`` (K, 2, 2) with larger covariances for pixels that are far from their prediction.
 
-    If the squared Mahalanobis distance of a ``residual`` (K, 2) is r times the gate, with r > 1, its noise is multiplied by r^2.
+    Let r be the ratio of a ``residual``'s (K, 2) squared Mahalanobis distance to the limit of inliers. If r > 1, the
+    noise is multiplied by r^2.
     """
     excess = np.maximum(1.0, squared(residual, innovation.each(noise)) / GATE)
     return np.asarray(noise * (excess**2)[:, None, None])

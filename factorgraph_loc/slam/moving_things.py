@@ -46,13 +46,13 @@ class MovingThings:
         self._doubts = False  # True while the newest image has tracks on moving objects
 
     def is_static(self, name: Hashable) -> bool:
-        """True if the feature track ``name`` is on a static object. While the image shows moving objects, only tracks
-        that agreed with the odometry count as static."""
+        """Return True if the feature track ``name`` is on a static object. While the image shows moving objects, only
+        tracks that agreed with the odometry count as static."""
         return name not in self.moving and (not self._doubts or name in self._steady)
 
     def learn(self, keyframe: Keyframe, names: Sequence[Hashable], pixels: Array, graph: Graph) -> None:
-        """Update the classification with a new image. ``keyframe``: the keyframe of the image. ``names``: its K tracks.
-        ``pixels`` (K, 2): their pixels. ``graph``: supplies the odometry between keyframes."""
+        """Update the classification with a new image. ``keyframe``: the keyframe of the image. ``names``: the names of
+        its K feature tracks. ``pixels`` (K, 2): their pixels. ``graph``: supplies the odometry between keyframes."""
         new_pixels = dict(zip(names, pixels, strict=True))
         self._images = [image for image in self._images if image[0].t >= keyframe.t - MAX_TIME]
         for old_keyframe, old_pixels in reversed(self._images):
@@ -82,8 +82,8 @@ class MovingThings:
 
 
 def another(model: CameraModel, first: Array, second: Array, step: Increment, right: Truths) -> Truths:
-    """Search another rotation of the robot that explains the feature tracks that disagree with the odometry. Returns a
-    mask (K,) of the tracks that fit this rotation.
+    """Search a second rotation that explains the feature tracks that disagree with the odometry. Returns a mask (K,) of
+    the tracks that fit this rotation.
 
     ``first``, ``second`` (K, 2): the pixels of K tracks in two images. ``step``: the motion of the odometry between the
     images. ``right`` (K,): mask of the tracks that agree with ``step``. The result is False everywhere if most tracks
@@ -104,7 +104,7 @@ def another(model: CameraModel, first: Array, second: Array, step: Increment, ri
 
 
 def fitting(model: CameraModel, first: Array, second: Array, step: Increment) -> Truths:
-    """Return a mask (K,) of the tracks that fit a motion ``step`` of the robot for some distance of the point.
+    """Return a mask (K,) of the feature tracks that fit a motion ``step`` of the robot, at a suitable distance.
 
     ``first``, ``second`` (K, 2): the pixels of K tracks before and after the motion. Two distances are tried. The first
     is where the rays are nearest to each other. The second is a Gauss-Newton step from there, which considers the

@@ -39,7 +39,7 @@ class PointSighting:
 
 
 def sightings_of(model: CameraModel, keyframe: int, pixels: Array) -> list[PointSighting]:
-    """Return the sightings of K points at ``pixels`` (K, 2) from the keyframe with number ``keyframe``."""
+    """Return one observation per row of ``pixels`` (K, 2), from the keyframe with number ``keyframe``."""
     rays = reprojection.rays(model, pixels)
     rays /= np.linalg.norm(rays, axis=1)[:, None]
     return list(map(PointSighting, repeat(keyframe), pixels, rays))
@@ -47,8 +47,8 @@ def sightings_of(model: CameraModel, keyframe: int, pixels: Array) -> list[Point
 
 @dataclass(frozen=True)
 class ChosenSightings:
-    """N sightings from a keyframe. ``rows``: their indices in the image's measurement. ``names``: the name of each
-    point, or the number of its feature track. ``pixels`` (N, 2): the observed pixels."""
+    """N observations of points (``sightings``) from a keyframe. ``rows``: their indices in the image's measurement.
+    ``names``: the name of each point, or the number of its feature track. ``pixels`` (N, 2): the observed pixels."""
 
     rows: list[int]
     names: list[Hashable]
@@ -80,7 +80,7 @@ class TriangulatedPoint:
     """A triangulated point.
 
     ``position`` (3,): in the world frame. ``covariance`` (3, 3): of the position, if the camera poses are exact.
-    ``squared`` (M,): squared whitened residuals of the sightings.
+    ``squared`` (M,): squared whitened residuals of the observations.
     """
 
     position: Array
@@ -89,9 +89,10 @@ class TriangulatedPoint:
 
 
 class NewPoints:
-    """Collects the sightings of points until the points can be triangulated.
+    """Collects observations of points until the points can be triangulated.
 
-    ``waiting``: the sightings of each point that is not triangulated yet, by its name or by the number of its track.
+    ``waiting``: the observations of each point that is not triangulated yet. Its key is a name, or the number of a
+    track.
     """
 
     def __init__(self, model: CameraModel) -> None:
@@ -99,32 +100,32 @@ class NewPoints:
         self.waiting: dict[Hashable, list[PointSighting]] = {}
 
     def count(self, name: Hashable) -> int:
-        """Return the number of collected sightings of the point ``name``."""
+        """Return the number of collected observations of the point ``name``."""
         return len(self.waiting.get(name, ()))
 
     def add(self, name: Hashable, sighting: PointSighting) -> None:
-        """Add a sighting of the point ``name``, and keep only the newest :data:`MAX_WAITING` sightings of this point."""
+        """Add an observation of the point ``name``. Only the newest :data:`MAX_WAITING` of a point are stored."""
         waiting = self.waiting.setdefault(name, [])
         waiting.append(sighting)
         del waiting[:-MAX_WAITING]
 
     def select(self, is_wanted: Callable[[Hashable], bool]) -> Mapping[Hashable, Sequence[PointSighting]]:
-        """Return the collected sightings, by name, of the points for which ``is_wanted(name)`` is True."""
+        """Return the collected observations, by name, of the points for which ``is_wanted(name)`` is True."""
         return {name: sightings for name, sightings in self.waiting.items() if is_wanted(name)}
 
     def forget(self, keyframe: int, wrong: Container[Hashable] = ()) -> None:
-        """Drop the points ``wrong``, and all points without a sighting in the last :data:`PATIENCE` keyframes before
-        number ``keyframe``."""
+        """Delete the points ``wrong``, and all points that were not observed in the last :data:`PATIENCE` keyframes
+        before number ``keyframe``."""
         since = keyframe - PATIENCE
         self.waiting = {k: v for k, v in self.waiting.items() if v[-1].keyframe >= since and k not in wrong}
 
     def ready(
         self, names: Iterable[Hashable], places: Callable[[int], KeyframeCamera | None], most: int = 1000
     ) -> list[tuple[Hashable, TriangulatedPoint, list[PointSighting]]]:
-        """Return the points among ``names`` that can be triangulated: name, point, and consistent sightings.
+        """Return (name, point, consistent observations) for the points among ``names`` that can be triangulated.
 
-        The sightings of a returned point are no longer collected. ``places``: a function that returns the camera pose
-        of a keyframe by number, None if its sightings must not be used. ``most``: the largest number of results.
+        The observations of a returned point are deleted. ``places``: a function that returns the camera pose of a
+        keyframe by number, None if its observations must not be used. ``most``: the largest number of results.
         """
         determined: list[tuple[Hashable, TriangulatedPoint, list[PointSighting]]] = []
         known: dict[int, KeyframeCamera | None] = {}
@@ -152,7 +153,7 @@ def has_parallax(
     last: PointSighting,
     last_camera: KeyframeCamera,
 ) -> bool:
-    """True if the angle between the rays of the sightings ``first`` and ``last`` is large enough to triangulate."""
+    """Return True if the angle between the rays of two observations of a point is large enough to triangulate it."""
     sigma = math.hypot(model.sigma, max(first_camera.slack, last_camera.slack)) / model.fx
     angle = max(MIN_PARALLAX, min(sigma / MAX_SPREAD, 0.5))
     return float((first_camera.rotation @ first.ray) @ (last_camera.rotation @ last.ray)) < math.cos(angle)
@@ -161,10 +162,10 @@ def has_parallax(
 def agreed(
     model: CameraModel, sightings: Sequence[PointSighting], places: Sequence[KeyframeCamera]
 ) -> tuple[TriangulatedPoint, list[PointSighting]] | None:
-    """Triangulate a point without outliers. Returns the point and its consistent sightings.
+    """Triangulate a point without outliers. Returns the point and its consistent observations.
 
-    ``places``: the camera pose of each sighting. While the residuals are too large, the worst sighting is removed.
-    Returns None if the remaining sightings do not determine the point.
+    ``places``: the camera pose of each observation. While the residuals are too large, the worst observation is
+    removed. Returns None if the remaining observations do not determine the point.
     """
     sightings, places = list(sightings), list(places)
     point = triangulate(model, sightings, places)
@@ -184,16 +185,16 @@ def agreed(
 
 
 def _fits(point: TriangulatedPoint, sightings: Sequence[PointSighting]) -> bool:
-    """True if the residuals of a point and its ``sightings`` pass a chi-square test."""
+    """Return True if the residuals of a point and its observations pass a chi-square test."""
     return bool(point.squared.sum() < chi_squared.quantile(GATE, 2 * len(sightings) - 3))
 
 
 def triangulate(
     model: CameraModel, sightings: Sequence[PointSighting], places: Sequence[KeyframeCamera]
 ) -> TriangulatedPoint | None:
-    """Triangulate a point from M ``sightings``, with minimal squared residuals in the images.
+    """Return a point triangulated from M observations, with minimal squared residuals in the images.
 
-    ``places``: the camera pose of each sighting. Residuals are infinite in cameras that have the point behind them.
+    ``places``: the camera pose of each observation. Residuals are infinite in cameras that have the point behind them.
     Returns None if the rays are nearly parallel, or if the standard deviation exceeds :data:`MAX_SPREAD` times the
     least depth.
     """

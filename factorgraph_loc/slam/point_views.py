@@ -33,8 +33,8 @@ class PointView:
     """A view of a point in the image of a keyframe.
 
     ``descriptor`` (D,): the descriptor of the feature. ``seen_from`` (3,): the camera position in the world frame.
-    ``travelled`` [m]: the path length of the robot from the start to this view.
-    ``keyframe``: the key of the keyframe's pose. ``guess``: this pose with covariance, as estimated when it was viewed.
+    ``travelled`` [m]: the path length of the robot from the start to this view. ``keyframe``: the key of the keyframe's
+    pose. ``guess``: this pose with covariance, as estimated at the time of the view.
     """
 
     descriptor: NDArray[Any]
@@ -80,7 +80,8 @@ class PointViews:
     def refound(
         self, camera: CameraPose, points: Sequence[int], positions: Array, frame: CameraFrame, rows: Sequence[int]
     ) -> list[tuple[int, int]]:
-        """Search lost points in an image. Returns pairs of an index in ``points`` and a row of ``frame``.
+        """Search points in an image after their tracks were lost. Returns pairs (index in ``points``, row of
+        ``frame``).
 
         ``camera``: the predicted camera pose. ``points``: keys of N points. ``positions`` (N, 3): their estimates.
         ``rows``: the features of ``frame`` that may be matched.
@@ -107,15 +108,15 @@ class PointViews:
             self._earlier.pop(point, None)
 
     def map_of(self, names: Sequence[str], keys: Sequence[int], positions: Array, covariances: Array) -> PointMap:
-        """Return a map of points with their last views. ``names``, ``keys``, ``positions`` (N, 3), ``covariances`` (N,
-        3, 3): of N points, in the order of the returned map."""
+        """Return a map of N points with their last views. ``names``, ``keys``, ``positions`` (N, 3), ``covariances``
+        (N, 3, 3): the data of the points, in the order of the returned map."""
         views = [(i, self._views[key]) for i, key in enumerate(keys) if key in self._views]
         return self._with_views(PointMap.of(tuple(names), positions, covariances), views)
 
     def settled(
         self, points: PointMap, keys: Sequence[int], values: Mapping[int, Array], pose_covariances: Mapping[int, Array]
     ) -> PointMap:
-        """Return the map ``points`` with all stored views, at the final poses of their keyframes.
+        """Return the map ``points`` with all stored views, computed from the final poses of their keyframes.
 
         ``keys``: the keys of the points. ``values``: final estimates by key, which include the poses of keyframes.
         ``pose_covariances``: body-frame covariances of these poses by key. The error of a pose is common to all points

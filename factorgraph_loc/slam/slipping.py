@@ -50,7 +50,7 @@ def unless_slipped(
 
 
 def moved_since(keyframes: Mapping[int, Keyframe], newest: Keyframe, t: float, most: int) -> Array | None:
-    """Return the covariance (3, 3) of the odometry from an earlier keyframe to the ``newest`` one, including detected slip.
+    """Return the covariance (3, 3) of the odometry since an earlier keyframe until ``newest``, including detected slip.
 
     The earlier keyframe is the last one at or before the time ``t`` [s], but at most ``most`` keyframes before
     ``newest``. Returns None if there is no odometry from the keyframe before ``newest``.

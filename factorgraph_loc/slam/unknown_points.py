@@ -52,8 +52,8 @@ REVISITED = 6  # this many inliers among old points are accepted, even if points
 
 @dataclass
 class _Point:
-    """A point of the graph. ``key``: its variable. ``last`` [s]: the time of its last sighting. ``information`` (3, 3):
-    the inverse covariance of its position for exact camera poses. ``strikes``: the number of consecutive outliers."""
+    """A point of the graph. ``key``: its variable. ``last`` [s]: the time of its last observation. ``strikes``: the
+    number of consecutive outliers. ``information`` (3, 3): the position's inverse covariance for exact camera poses."""
 
     key: int
     last: float
@@ -102,10 +102,10 @@ class UnknownPoints(Mapper):
         addition: Addition,
         movers: MovingThings,
     ) -> Guess:
-        """Add ``rows`` of the image ``m`` of a new keyframe to the graph. Returns the pose ``guess``, corrected by points.
+        """Add ``rows`` of the image ``m`` of a new keyframe to the graph. Returns ``guess``, corrected by points.
 
         The covariance of the pose is not reduced, because the points are as uncertain as the poses that observed them.
-        ``addition``: receives the new factors and variables. ``movers``: the tracks on moving objects.
+        ``addition``: receives the new factors and variables. ``movers``: the feature tracks on moving objects.
         """
         model = self.model
         constants = graph.mapped_constants
@@ -137,8 +137,8 @@ class UnknownPoints(Mapper):
     def _observe_points(
         self, image: _NewImage, guess: Guess, chosen: ChosenSightings, certain: set[int]
     ) -> tuple[Guess, int]:
-        """Add the sightings ``chosen`` of points that the graph contains. Returns the pose ``guess``, corrected by these
-        points, and their number. ``certain``: the rows of points that a loop closure recognized."""
+        """Add the observations ``chosen`` of points that the graph contains. Returns the pose ``guess``, corrected by
+        these points, and their number. ``certain``: the rows of points that a loop closure recognized."""
         m, keyframe = image.m, image.keyframe
         old = [i for i, name in enumerate(chosen.names) if name in self._points]
         old = [old[i] for i in spread_out(chosen.pixels[old], PER_KEYFRAME).tolist()]
@@ -157,7 +157,7 @@ class UnknownPoints(Mapper):
     def _add_points(
         self, image: _NewImage, guess: Guess, chosen: ChosenSightings, most: int, movers: MovingThings
     ) -> Array:
-        """Collect sightings of points not in the graph, and add up to ``most`` triangulated points to the graph.
+        """Collect observations of points not in the graph, and add up to ``most`` triangulated points to the graph.
 
         Returns the pose (3,) of the keyframe. It is adjusted together with the new points if the points of the graph do
         not determine it. ``movers``: the tracks on moving objects.
@@ -275,7 +275,7 @@ class UnknownPoints(Mapper):
         return [point.key for point in gone]
 
     def keep_only(self, keys: set[int]) -> None:
-        """Delete all points whose key is not in ``keys``, and all collected sightings of points that are not in the graph."""
+        """Delete all points whose key is not in ``keys``, and all observations of points that are not in the graph."""
         self._views.forget({point.key for point in (*self._points.values(), *self._astray)} - keys)
         self._points = {name: point for name, point in self._points.items() if point.key in keys}
         self._astray = [point for point in self._astray if point.key in keys]
@@ -292,7 +292,7 @@ class UnknownPoints(Mapper):
 
     def learnt(self, values: Mapping[int, Array], covariances: Mapping[int, Array]) -> PointMap | None:
         """Return a map of all stored points, including points removed from the graph. Returns None if there are none.
-        ``values``, ``covariances``: estimates of points and keyframes, by key."""
+        ``values``, ``covariances``: the estimates and covariances of points and keyframes, by key."""
         keys: dict[str, int] = {}
         for point in sorted((*self._points.values(), *self._astray, *self._gone), key=lambda point: point.key):
             if point.key in values:
@@ -372,7 +372,7 @@ class UnknownPoints(Mapper):
     def _add_observation(
         self, image: _NewImage, name: Hashable, sighting: PointSighting, agrees: bool, pose: Array
     ) -> None:
-        """Add a sighting of the point ``name`` from ``pose`` (3,), or count an outlier if ``agrees`` is False."""
+        """Add an observation of the point ``name`` from ``pose`` (3,), or count an outlier if ``agrees`` is False."""
         point = self._points[name]
         if not agrees:
             self.diagnostics.reject("camera: point disagrees with the other points of the image")
