@@ -72,9 +72,9 @@ class Worker:
             self.connection.send(content)
 
     def receive(self) -> Any:
-        """Receive the next answer of the process: ``READY``, the value of the job, or the exception that the job raised.
+        """Wait for the next answer of the process and return it. Return a ProcessDiedError if the process has ended.
 
-        Return a ProcessDiedError if the process has ended.
+        The answer is ``READY``, the value of the job, or the exception that the job raised.
         """
         try:
             answer, traceback_text = self.connection.recv()

@@ -39,10 +39,10 @@ def view(
     """Show a log and its runs over time in the viewer Rerun.
 
     ``results``: folders of runs or comparisons, or only a log. The log of the runs must be given too, unless
-    :func:`~factorgraph_loc.api.logs.datasets` lists it.
-    ``rrd``: a file to write for the viewer instead of opening it.
-    ``bind``: the IP address at which the viewer listens, without a password. By default only this machine can connect.
-    Raises InputError if ``rerun-sdk`` is not installed, if the viewer does not start, or if the file cannot be written.
+    :func:`~factorgraph_loc.api.logs.datasets` lists it. ``rig``, ``world``: replace those of the log. ``rrd``: a file
+    to write for the viewer instead of opening it. ``bind``: the IP address at which the viewer listens, without a
+    password. By default only this machine can connect. Raises InputError if ``rerun-sdk`` is not installed, if the
+    viewer does not start, or if the file cannot be written.
     """
     log, runs = stored(_listed(results), lambda name: read_log(name, rig=rig, world=world))
     show(log, runs, None if rrd is None else Path(rrd), bind)
@@ -57,8 +57,9 @@ def export(
 ) -> list[Path]:
     """Write results for other programs. Returns the written files.
 
-    ``results``: folders of runs, or a log. ``out``: a file. Its suffix selects the content: .mcap for runs in Foxglove
-    and RViz; .tum or .kitti for the final trajectory of a run, or the reference of a log; .ply for points of a map.
+    ``results``: folders of runs, or a log. ``rig``, ``world``: replace those of the log. ``out``: a file. Its suffix
+    selects the content: .mcap for runs in Foxglove and RViz; .tum or .kitti for the final trajectory of a run, or the
+    reference of a log; .ply for points of a map.
     """
     require_format(Path(out))
     log, runs = stored(_listed(results), lambda name: read_log(name, rig=rig, world=world))

@@ -26,7 +26,7 @@ SMOOTHER = "smoother"
 
 @dataclass(frozen=True)
 class Run:
-    """The outcome of a run.
+    """The estimates of one estimator on one log, and their scores.
 
     ``result``: the estimates. ``scores``: the scores, as in ``metrics.json``. ``learnt``: the constants of the rig that
     were estimated from the log, empty unless requested.

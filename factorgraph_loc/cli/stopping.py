@@ -45,9 +45,10 @@ def end(stop: KeyboardInterrupt) -> int:
 
 @contextmanager
 def unwrapped() -> Iterator[None]:
-    """If an exception in this block was caused by a :class:`Stop`, raise the :class:`Stop` instead.
+    """If an exception in this block was caused by a :class:`Stop`, which a signal raises, raise the :class:`Stop`
+    instead.
 
-    A compiled module raises ImportError if a :class:`Stop` interrupts its import.
+    For example, a compiled module raises ImportError if a signal interrupts its import.
     """
     try:
         yield

@@ -77,7 +77,7 @@ class Cells:
         return values
 
     def nanoseconds(self) -> Integers:
-        """Return the timestamps (N,) [ns] of a table of the native format. Raises InputError if one is no whole number."""
+        """Return the timestamps (N,) [ns] in the field ``t_ns``. Raises InputError if one is no whole number."""
         return self._of_one_log(self._known(self._nanoseconds()))
 
     def stamps(self, name: str, offset: float = 0.0) -> Integers:
@@ -140,8 +140,7 @@ class Cells:
                 raise fault.error(self.path, self.rows, self.rules.skipping if self.rules and is_few else "")
 
     def fault(self, name: str, wrong: NDArray[np.bool_], expected: str) -> Fault:
-        """Return a mark of invalid cells of the field ``name``. ``wrong`` (N,): their mask. ``expected``: describes
-        valid cells."""
+        """Return the invalid cells of a field. ``wrong`` (N,): mask of them. ``expected``: describes valid cells."""
         return Fault(self.labels.get(name, name), self.columns[name], wrong, expected)
 
     def _faults(self, name: str, column: Column) -> Sequence[Fault]:

@@ -305,7 +305,7 @@ def _require_columns(
 
 
 def _read_json_lines(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]) -> Cells:
-    """Read the mapped columns of a file. Each line of the file is a JSON object or a list of JSON objects.
+    """Return the mapped columns of a file whose lines are JSON objects or lists of JSON objects.
 
     Objects that ``where`` excludes or that lack a ``needed`` column are ignored. Raises InputError if all objects lack
     one."""

@@ -202,7 +202,7 @@ SINCE_1970 = {"ns": 1e17, "us": 1e14, "ms": 1e11, "s": 1e8}
 
 
 def unit_since_1970(stamp: float) -> str | None:
-    """Guess the unit of a timestamp since 1970 from its size. Return None if it is too small for any unit."""
+    """Return the unit of a timestamp since 1970, guessed from its size, or None if it is too small for any unit."""
     return next((unit for unit, least in SINCE_1970.items() if abs(stamp) > least), None)
 
 
@@ -216,7 +216,8 @@ def number(
     may_lack: bool = False,
     left_out_below: float = -math.inf,
 ) -> Column:
-    """Return a :class:`Column` of numbers. The arguments are the values of its fields."""
+    """Return a :class:`Column` of numbers. ``units``: by name, the factors that convert units to the first unit.
+    ``low``, ``high``: inclusive bounds. ``doc``: meaning. For the other arguments see the fields of :class:`Column`."""
     return Column(name, "number", units, low, high, may_lack, doc, left_out_below=left_out_below)
 
 

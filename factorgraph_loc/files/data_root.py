@@ -27,11 +27,11 @@ def find_data_root(data_root: str | Path | None, source: object) -> Path:
 
 
 def named_path(folder: Path, name: str, source: object, data_root: str | Path | None, expected: str = EXPECTED) -> Path:
-    """Resolve the path ``name`` that a manifest or an experiment file contains.
+    """Return the path that ``name``, a text in a manifest or an experiment file, refers to.
 
     ``source``: the file that contains ``name``. ``folder``: the folder of ``source``. The path must lead below
-    ``folder`` or below ``data_root``, which is the environment variable FGLOC_DATA by default. The path need not
-    exist. ``expected``: end of the message if the path leads elsewhere. Raises InputError if it does.
+    ``folder`` or below ``data_root``, which is the environment variable FGLOC_DATA by default. Otherwise InputError is
+    raised. The path need not exist. ``expected``: end of the error.
     """
     data = os.environ.get(DATA_ROOT) if data_root is None else data_root
     folders = [Path(data)] if data and Path(data).is_dir() else []

@@ -121,7 +121,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def parse_toml(text: str, source: object) -> dict[str, Any]:
-    """Parse a text in TOML. ``source``: the file or option, for messages. Raises InputError if the text is invalid."""
+    """Return the content of a TOML text. ``source``: the file or option, for errors. Raises InputError if invalid."""
     for row, line in enumerate(text.split("\n"), start=1):
         # the time that tomllib needs grows with the square of the number of parts
         if line.count(".") >= DEEPEST and _LONG_KEY.search(line):
@@ -158,7 +158,7 @@ def read_json(path: Path) -> Any:
 
 
 def parse_json(text: str, source: object) -> Any:
-    """Parse a text in JSON. ``source``: the file, for messages. Raises InputError if the text is invalid."""
+    """Return the content of a JSON text. ``source``: the file, for errors. Raises InputError if the text is invalid."""
     try:  # faster than bounded.foreign, which matters for a million lines
         content = _JSON.decode(text)
     except RecursionError as error:
@@ -171,7 +171,7 @@ def parse_json(text: str, source: object) -> Any:
 
 
 def parse_model(kind: type[Model], content: Mapping[str, Any], source: object) -> Model:
-    """Validate ``content`` as a model of class ``kind``. ``source``: the file, for messages.
+    """Return ``content``, keys and values, as an instance of the class ``kind``. ``source``: the file, for errors.
 
     Raises InputError at the first invalid value, with its key, the value, and what is expected.
     """
@@ -248,7 +248,7 @@ def set_key(content: dict[str, Any], key: str, value: Any, source: object) -> No
 
 
 def flattened(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield each value in the nested tables ``content`` and its path: ``prefix`` and the keys, such as ``a.b.c``."""
+    """Yield (path, value) for each value in the nested tables ``content``. A path is ``prefix`` plus ``a.b.c``."""
     for key, value in content.items():
         if isinstance(value, Mapping):
             yield from flattened(value, f"{prefix}{key}.")
@@ -328,10 +328,10 @@ def write_toml(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def _leaves(content: Any, source: object) -> Iterator[tuple[str, Any]]:
-    """Yield each value in the nested tables and lists ``content`` and its key. Floats are omitted.
+    """Yield (key, value) for each value in the nested tables and lists ``content``. Floats are omitted.
 
-    Raises InputError if there are more than :data:`MOST_ENTRIES` values, or they are nested deeper than :data:`DEEPEST`.
-    """
+    Raises InputError if there are more than :data:`MOST_ENTRIES` values, or they are nested deeper than
+    :data:`DEEPEST`."""
     waiting = [("", content, 0)]
     count = 0
     while waiting:

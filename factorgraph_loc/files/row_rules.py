@@ -41,7 +41,8 @@ class Fault:
 
 
 class RowRules(FileModel):
-    """Settings of a reader for invalid rows, and for rows out of order. ``PLACE``: the file with them, in messages."""
+    """Settings of a reader: whether invalid rows, and rows out of order, are errors. ``PLACE``: name of the file that
+    has these settings, for errors."""
 
     PLACE: ClassVar[str] = "the manifest"
     bad_rows: Literal["refuse", "skip"] = "refuse"

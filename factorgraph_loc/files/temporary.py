@@ -32,12 +32,19 @@ _own: set[Path] = set()  # paths created by this process and not yet removed
 
 
 def temporary_file(path: Path) -> AbstractContextManager[Path]:
-    """Create an empty file next to ``path``, with the same suffix. It is removed at the end of the block unless it was renamed."""
+    """Return a context manager that creates an empty file next to ``path``, with the same suffix, and gives its path.
+
+    The file is removed at the end of the block unless it was renamed.
+    """
     return _created(path, path.stem, path.suffix, folder=False)
 
 
 def temporary_folder(path: Path) -> AbstractContextManager[Path]:
-    """Create a folder next to ``path`` that only the user can access. It is removed with its content at the end of the block."""
+    """Return a context manager that creates a folder next to ``path``, with access only for this user, and gives its
+    path.
+
+    The folder and its content are removed at the end of the block.
+    """
     return _created(path, path.name, "", folder=True)
 
 

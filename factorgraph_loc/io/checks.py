@@ -27,7 +27,7 @@ TOLERANCE = 1e-9  # relative tolerance for converted values
 
 
 def require_bounds(log: Log) -> None:
-    """Raise InputError, with the time, at the first value of a log that is outside of the bounds of its column."""
+    """Raise InputError, with the time, at the first measured value of a log that is outside of its allowed bounds."""
     for name, stream in log.streams.items():
         for column in columns_of(channel(name), stream) if kind_of(name) in channels() else ():
             _require(f"{log.name}: {name}", column, stream.t, getattr(stream, column.name))
@@ -77,7 +77,7 @@ def long_gaps(t: Array) -> tuple[tuple[float, float], ...]:
 
 
 def gap_warnings(name: str, gaps: Sequence[tuple[float, float]]) -> list[Notice]:
-    """Return a warning about the ``gaps`` (start [s], length [s]) of the stream ``name``. The list is empty without gaps."""
+    """Return a list with a warning about the ``gaps`` (start, length) [s] of the stream ``name``, if there are any."""
     if not gaps:
         return []
     start, length = max(gaps, key=lambda gap: gap[1])

@@ -51,7 +51,8 @@ APART = 5.0  # s: maximum gap between the time spans of two tables; at a larger 
 
 @dataclass
 class _Roles:
-    """The proposed roles of tables. ``tables``: by role, such as ``odometry``. ``remarks``: hints for the user."""
+    """The tables of a folder with their proposed uses. ``tables``: by the use, such as ``odometry``. ``remarks``: hints
+    for the user."""
 
     tables: dict[str, Guess] = field(default_factory=dict)
     remarks: list[str] = field(default_factory=list)
@@ -202,7 +203,7 @@ def _roles(guesses: Sequence[Guess]) -> _Roles:
 
 
 def _role(table: Guess) -> str | None:
-    """Return the role that the fields of a table imply. Returns None for a table of poses, and for a table of unknown content."""
+    """Return the use that the fields of a table imply, such as "odometry", or None for poses and unknown fields."""
     if not table.has("t"):
         return "tags" if table.has("epc", "x", "y") else "landmarks" if table.has("landmark", "x", "y") else None
     if table.has("epc"):

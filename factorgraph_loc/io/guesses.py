@@ -275,7 +275,7 @@ def _add_time(out: Guess) -> None:
 
 
 def _unit_of_times(values: Array) -> str:
-    """Guess the unit of timestamps: by their size if they count from 1970, else by the median step between them."""
+    """Return the guessed unit of timestamps: by their size if they count from 1970, else by the median step."""
     if (unit := unit_since_1970(float(values[0]))) is not None:
         return unit
     step = float(np.median(np.diff(np.unique(values))))

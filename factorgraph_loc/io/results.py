@@ -29,7 +29,8 @@ FILES = (FINAL, CAUSAL, ESTIMATES, INNOVATIONS, LEARNT, EVENTS, CONFIG, METRICS)
 
 @dataclass(frozen=True)
 class Estimates:
-    """The causal estimates of a stored run, or the final estimates, which use the whole log.
+    """The estimated poses of a stored run: causal ones, which use earlier measurements only, or final ones, which use
+    the whole log.
 
     ``trajectory``: N estimated poses. ``errors``: by the names in :data:`ERRORS`, the errors of position (N,) [m] and
     heading (N,) [rad], and the normalised estimation error squared (N,). An unknown error is NaN.

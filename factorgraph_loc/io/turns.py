@@ -18,7 +18,8 @@ OVERLAP = 0.9  # minimum fraction of the shorter table that must overlap the oth
 
 @dataclass(frozen=True)
 class Turns:
-    """The turns of a robot over time. ``t`` (N,): times [s]. ``angle`` (N,): the unwrapped heading, in any unit."""
+    """The heading of a robot over time, from one table. ``t`` (N,): times [s]. ``angle`` (N,): the unwrapped heading in
+    any unit."""
 
     t: Array
     angle: Array
@@ -33,7 +34,7 @@ class Turns:
 
 @dataclass(frozen=True)
 class SameTurns:
-    """The comparison of two tables that show the same turns.
+    """The clock offset and the ratio of angles between two tables that recorded the same turns of a robot.
 
     ``offset`` [s]: the clock of the first table minus the clock of the second; None if the turns agree at several
     offsets. ``ratio``: the angle of the first table divided by the angle of the second.

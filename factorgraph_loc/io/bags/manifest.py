@@ -57,7 +57,8 @@ class TopicUse:
 
 @dataclass(frozen=True)
 class BagManifest(Proposal):
-    """The proposed manifest of a bag. ``duration``: length of the bag [s]. ``topics``: all topics of the bag."""
+    """A proposed manifest, which describes how to read the log in a bag. ``duration``: length of the bag [s].
+    ``topics``: all topics of the bag."""
 
     duration: float
     topics: tuple[TopicUse, ...]

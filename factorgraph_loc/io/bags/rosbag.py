@@ -98,7 +98,7 @@ def _antenna(name: str, pose: Array) -> AntennaSettings:
 
 
 class Options(FileModel):
-    """The options of the reader of bags: the settings of the topic of each sensor."""
+    """The options of the reader of ROS bags: for each sensor, the settings of its topic."""
 
     odometry: OdometryTopic
     imu: ImuTopic | None = None

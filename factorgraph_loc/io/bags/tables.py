@@ -57,7 +57,7 @@ STAMP_OF_READ = replace(STAMP, name="stamp")
 
 
 class TableTopic(RowTopic):
-    """The settings of a topic whose messages are the rows of a sensor's table."""
+    """The settings of a topic with the measurements of a sensor, such as positions."""
 
     fields: dict[str, str] = Field(default_factory=dict)
     """path of the message field for each column of the table; by default the field with the name of the column"""
@@ -66,14 +66,12 @@ class TableTopic(RowTopic):
 
 
 class RowsOfTopic:
-    """Collects the rows of a table from the messages of a topic.
+    """Collects the measurements of a sensor from the messages of a topic, as rows of a table.
 
-    ``fields``: the path of the message field for each column.
-    ``table``: the description of the table's columns.
-    ``columns``: the columns to collect, by default all columns except the first, which is the time.
-    ``units``: the unit of a column, or a factor that converts its values to the default unit.
-    ``rules``: whether invalid rows are skipped and late rows sorted; otherwise they are errors.
-    A missing number becomes NaN. An empty name raises InputError.
+    ``fields``: the path of the message field for each column. ``table``: the description of all columns that the sensor
+    has. ``columns``: the columns to collect, by default all except the first, which is the time. ``units``: the unit of
+    a column, or a factor that converts its values to the default unit. ``rules``: whether invalid rows are skipped and
+    late rows sorted; otherwise they are errors. A missing number becomes NaN. An empty name raises InputError.
     """
 
     def __init__(

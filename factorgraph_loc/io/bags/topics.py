@@ -41,7 +41,7 @@ MAX_DELAY = 0.5  # s; larger differences between topics are clock offsets, not d
 
 
 class TopicSettings(FileModel):
-    """The settings that all topics have."""
+    """The settings that each ROS topic has, for example that of a camera."""
 
     topic: str
     """name of the topic"""
@@ -51,7 +51,7 @@ class TopicSettings(FileModel):
 
 
 class RowTopic(TopicSettings, RowRules):
-    """The settings of topics with optional skipping of invalid messages and sorting of late ones."""
+    """Base class of settings of a ROS topic. Invalid messages may be skipped, and late ones sorted."""
 
 
 class Fields:
@@ -69,10 +69,10 @@ class Fields:
         self._are_lists = [LIST in path for path in paths.values()]
 
     def rows(self, message: Any, row: int) -> list[Row]:
-        """Return the values of message number ``row``, as tuples in the order of ``names``.
+        """Return the values of the fields in ``message``, as a list of tuples in the order of ``names``.
 
-        Without lists in the paths there is one tuple, else one for each element of the lists. Raises InputError if the
-        lists have different lengths.
+        The list has one tuple, or if a path leads through a list, one for each element. ``row``: number of the message,
+        for errors. Raises InputError if lists have different lengths.
         """
         values = [get(message) for get in self._getters]
         if not any(self._are_lists):
@@ -274,13 +274,13 @@ class Listeners:
         return Stamper(self.bag, self.bag.topic(topic), clock or self.clock)
 
     def add(self, topic: str, gatherer: Gatherer, stamper: Stamper | None = None) -> None:
-        """Register a collector for a topic. Without a ``stamper``, the timestamps are the times of receipt."""
+        """Register the collector ``gatherer`` for a topic. Without ``stamper``, timestamps are times of receipt."""
         self._of.setdefault(topic, []).append((stamper, gatherer))
         if stamper is not None:
             self.stampers.append(stamper)
 
     def listen(self, options: TopicSettings, gatherer: G) -> G:
-        """Register a collector for the topic of these options, with the clock of the options, and return the collector."""
+        """Register the collector ``gatherer`` for the topic and the clock in ``options``, and return the collector."""
         self.add(options.topic, gatherer, self.stamper(options.topic, options.clock))
         return gatherer
 

@@ -44,10 +44,10 @@ def reader(name: str) -> Any:
 
 @dataclass(frozen=True)
 class _Source:
-    """Where a log comes from.
+    """Describes where a log is and how it is read.
 
-    ``reader``: name of the reader. ``path``: its input. ``name``: name of the log, None if the reader names it.
-    ``manifest``: the manifest that describes the log, if there is one. ``file``: the file of the manifest."""
+    ``reader``: name of the reader. ``path``: the file or folder to read. ``name``: name of the log, None if the reader
+    names it. ``manifest``: the manifest that describes the log, if there is one. ``file``: the file of the manifest."""
 
     reader: str
     path: Path | None

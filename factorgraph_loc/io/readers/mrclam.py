@@ -25,7 +25,8 @@ class Options(FileModel):
 
 
 def read(path: Path | None, options: Options) -> Log:
-    """Return the log of one robot from the folder ``path``. Raises InputError with file and row of an invalid value."""
+    """Return the log of one robot of the data set MRCLAM from the folder ``path``. ``options``: the number of the
+    robot. Raises InputError with file and row of an invalid value."""
     file = shipped.readers()["mrclam"]
     text = read_text(file, bounded.SETTINGS).replace("{robot}", str(options.robot))
     manifest = parse_model(Manifest, parse_toml(text, file), file)

@@ -97,10 +97,10 @@ def _read(
 
 
 def read_pose_file(path: Path, kind: Format | None = None, rules: RowRules | None = None) -> PosePath:
-    """Return the poses of a file in TUM, KITTI or EuRoC format.
+    """Return the poses of a file in TUM, KITTI or EuRoC format, and warnings as their attribute ``warnings``.
 
     ``kind``: the expected format, by default any. ``rules``: whether invalid rows are skipped and late rows sorted.
-    None: both are errors. Of poses with equal timestamps, the last is kept. Null poses, which mean that the pose was
+    None: both are errors. Of poses with equal timestamps, the last is used. Null poses, which mean that the pose was
     lost, are skipped with a warning. Raises InputError with file and row of an invalid value.
     """
     row, first = _first_row(path)
