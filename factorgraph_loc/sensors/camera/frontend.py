@@ -70,7 +70,7 @@ class _ImageFile:
 def with_features(
     log: Log, settings: FrontendSettings, progress: Callable[[float], None] | None = None
 ) -> tuple[Log, tuple[Notice, ...]]:
-    """Replace the images of a log by features and tracks. Returns the changed log and warnings.
+    """Return the log with features and tracks instead of images, and warnings.
 
     An image that is missing, cannot be decoded or has another size than the rig's camera becomes a frame without
     features. ``progress`` is called with the completed fraction. A log without images is returned unchanged. Raises
@@ -123,8 +123,8 @@ def _features(
 
 
 def _from_cache(file: Path, about: str, kept: FeatureCache) -> _ImageFile:
-    """Read the features of an image from the cache ``kept``. Returns them with the cache key, a hash of the bytes of
-    ``file`` and of the text ``about``."""
+    """Return the features of an image from the cache ``kept``, or None as features if it lacks them. Also sets the
+    cache key, a hash of the bytes of ``file`` and of the text ``about``."""
     try:
         content = read_bytes(file, IMAGE)
     except InputError as error:
@@ -135,8 +135,8 @@ def _from_cache(file: Path, about: str, kept: FeatureCache) -> _ImageFile:
 
 
 def _find(file: Path, key: str, settings: FrontendSettings, size: Size, kept: FeatureCache) -> _ImageFile:
-    """Compute the features of an image and write them to the cache ``kept`` with the ``key``. Returns the features, or
-    the error message if the file is unusable. ``size``: width and height of the camera's images [px]."""
+    """Return the features of an image, or the error message if the file is unusable. The features are written to the
+    cache ``kept`` with the ``key``. ``size``: width and height of the camera's images [px]."""
     try:
         image = read_image(file)
     except InputError as error:
@@ -175,7 +175,8 @@ def _tracks(
     camera: CameraModel,
     kept: FeatureCache,
 ) -> list[Integers]:
-    """Return, for each image, the track numbers (K,) of its K features, from the cache ``kept`` if possible."""
+    """Return the track numbers (K,) of the K features of each image, from the cache ``kept`` if possible. A track is a
+    point that occurs in several images."""
     order = np.argsort(stream.t, kind="stable").tolist()
     about = f"tracks {settings.feature} {camera.intrinsics().tolist()} {code_version(TRACK_CODE)} "
     key = hashlib.sha256(
@@ -197,7 +198,7 @@ def _tracks(
 
 
 def _require_calibrated(log: Log, images: list[_ImageFile], camera: CameraModel) -> None:
-    """Raise InputError if images are readable, but none has the size that the camera is calibrated for."""
+    """Raise InputError if some images are readable, but none has the size that the camera is calibrated for."""
     sizes = [image.other_size for image in images if image.other_size is not None]
     if sizes and not any(image.found for image in images):
         width, height = sizes[0]
@@ -309,7 +310,7 @@ class LiveFrontend:
         self._tracker = FeatureTracker(camera)
 
     def frame(self, t: float, image: object) -> CameraFrame:
-        """Return the features of an image that was taken at ``t`` [s].
+        """Return the features of an image that was taken at ``t`` [s], with their track numbers.
 
         ``image``: an array, see :func:`~factorgraph_loc.vision.images.as_image`. Raises InputError if the array is
         invalid, or if the camera is calibrated for another image size.

@@ -45,7 +45,7 @@ NOT_DISPLACED: Mapping[str, tuple[Array, Array]] = MappingProxyType({})
 
 @dataclass(frozen=True)
 class Predicted:
-    """The current estimate of the state, from which the positions of points in an image are predicted.
+    """The current estimate of the state. It predicts the positions of points in an image.
 
     ``pose`` (3,) with body-frame ``covariance`` (3, 3): the pose of the robot. ``constants`` (P,) with covariance
     ``spread`` (P, P): estimated corrections of P camera constants in the rig, None if no constants are estimated.
@@ -105,8 +105,8 @@ class KnownPoints:
         return TIME_OFFSET in self._estimated.indices
 
     def inexact(self, m: Pixels) -> dict[str, tuple[list[str], Array]]:
-        """Return the points in ``m`` with an inexact survey. Keys are the names of markers and of single points. A
-        value contains the names of the points, and the covariance (3, 3) of the survey error that they share."""
+        """Return the points in ``m`` with an inexact survey. Keys are names of markers, or of points without a marker.
+        Values are the names of the points, and the covariance (3, 3) [m^2] of the survey error that they share."""
         inexact: dict[str, tuple[list[str], Array]] = {}
         if not isinstance(m, PixelSightings) or not self._inexact.any():
             return inexact
@@ -143,7 +143,7 @@ class KnownPoints:
         ``predicted``: the estimate at which outliers are detected. ``offset``: the motion from the pose that the factor
         depends on to the image, None if the times are equal. ``twist`` (3,): the robot's velocity at the image,
         required if the camera's time offset is estimated. ``displaced``: by the name of a point, its estimated
-        displacement (3,) from the map, and the covariance (3, 3) of its position.
+        displacement (3,) [m] from the map, and the covariance (3, 3) of its position.
         """
         self.used = np.empty(0, dtype=np.int64)
         factor = self.named(m) if isinstance(m, PixelSightings) else self._empty_factor(m)
@@ -181,8 +181,8 @@ class KnownPoints:
         return levelled
 
     def find(self, m: Pixels) -> tuple[FoundOnFloor | None, int]:
-        """Find the robot's pose at an image without a prediction. Returns the pose, or None, and the number of points
-        of the map that are expected in the image."""
+        """Return the robot's pose at an image, computed without a prediction, or None if no pose fits. Also return the
+        number of points of the map that are expected in the image."""
         model = self.model
         if not len(self.map):
             return None, 0
@@ -204,8 +204,8 @@ class KnownPoints:
         return ReprojectionFactor(model, self.map.positions[points], pixels, point_covariances=covariances)
 
     def _empty_factor(self, m: CameraFrame) -> ReprojectionFactor | None:
-        """Return a factor without points, to which the caller adds matches. Returns None if the features cannot be
-        matched with the map."""
+        """Return a factor without points, as a start for the caller. Returns None if the features in ``m`` cannot be
+        matched."""
         self.names = ()
         if self.associator is None:
             if not self._others_matter:
@@ -219,8 +219,9 @@ class KnownPoints:
     def _matched(
         self, m: CameraFrame, factor: ReprojectionFactor, model: CameraModel, camera: CameraPose, focal: float
     ) -> ReprojectionFactor | None:
-        """Match the features of the image ``m`` with the map. Returns ``factor`` with the matched points, or None
-        without matches. ``camera``: the predicted pose. ``focal``: relative standard deviation of the focal length."""
+        """Return ``factor`` with the points of the map that match features of the image ``m``, or None without matches.
+        ``model``: the camera model with estimated constants. ``camera``: the predicted pose. ``focal``: relative
+        standard deviation of the focal length."""
         assert self.associator is not None
         matches = self.associator.guided(m, camera, model, focal)
         self.used = matches.features
@@ -239,7 +240,7 @@ class KnownPoints:
     def _with_tilt(
         self, factor: ReprojectionFactor, expected: ReprojectionFactor, predicted: Predicted
     ) -> ReprojectionFactor | None:
-        """Estimate the tilt of the robot from an image. Returns ``factor`` with a new standard deviation of the tilt.
+        """Return ``factor`` with a new standard deviation of the robot's tilt, which is estimated from the image.
 
         ``expected``: the same factor with fixed constants. Returns None if the tilt exceeds :data:`STEEPEST`, because
         the matches are then probably wrong.
@@ -284,8 +285,8 @@ def lifted(model: CameraModel, pose: Array, covariance: Array) -> CameraPose:
 
 
 def _inliers(expected: ReprojectionFactor, camera: CameraPose, focal: float) -> Truths:
-    """Return a mask (K,) of the points of ``expected`` that are inliers, all True if there are too few points to
-    decide. ``camera``: the predicted pose. ``focal``: relative standard deviation of the focal length."""
+    """Return a mask (K,) that is True for the points of ``expected`` that are inliers. It is True for all if there are
+    too few points. ``camera``: the predicted pose. ``focal``: relative standard deviation of the focal length."""
     model, count = expected.model, len(expected.pixels)
     if count < FEWEST:
         return np.ones(count, dtype=bool)

@@ -71,8 +71,8 @@ Pixels = PixelSightings | CameraFrame  # measurements of a camera that estimator
 
 @dataclass(frozen=True)
 class SightingStream(Stream):
-    """All named points in images of a log, one per row. ``point``: the names. ``u``, ``v`` (N,): the positions [px].
-    Rows with equal timestamps form one measurement."""
+    """All N named points in images of a log, one per row. ``point``: the names. ``u``, ``v`` (N,): the image positions
+    [px]. Rows with equal timestamps form one measurement."""
 
     kind: ClassVar[type[Any]] = PixelSightings
     point: Sequence[str]
@@ -88,7 +88,8 @@ class SightingStream(Stream):
 
 @dataclass(frozen=True)
 class ImageStream(Stream):
-    """The N images of a log. ``file``: the paths of the images. Runs use a :class:`FeatureStream` instead."""
+    """The N images of a log. ``file``: the paths of the images. For a run, they are replaced by a
+    :class:`FeatureStream`."""
 
     kind: ClassVar[type[Any]] = CameraImage
     file: Sequence[Path]
@@ -99,7 +100,8 @@ class ImageStream(Stream):
 
 @dataclass(frozen=True)
 class FeatureStream(Stream):
-    """The features ``frame`` of N images of a log, taken at ``t`` (N,) [s]. The timestamps in ``frame`` are ignored."""
+    """The features of N images of a log. ``t`` (N,): the time [s] of each image. ``frame``: the features of each image.
+    The timestamps inside ``frame`` are ignored."""
 
     kind: ClassVar[type[Any]] = CameraFrame
     frame: Sequence[CameraFrame]
@@ -178,8 +180,8 @@ def disassemble(stream: Stream, writing: Writing) -> dict[str, Columns]:
 
 
 def write_images(files: Sequence[Path], folder: Path) -> list[str]:
-    """Copy images into a new folder ``camera`` in ``folder``. Returns their new names, which are numbers. Raises
-    InputError if an image is missing."""
+    """Copy the images ``files`` into a new folder ``camera`` in ``folder``. Returns the new file names, which are
+    numbers in the order of ``files``. Raises InputError if an image is missing."""
     target = folder / FOLDER
     target.mkdir()
     names = [f"{i:06d}{file.suffix}" for i, file in enumerate(files)]

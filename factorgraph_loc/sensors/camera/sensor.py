@@ -42,7 +42,7 @@ class PixelObservation(ResidualObservation):
     """The observation of points in one image.
 
     ``seen``: the factor of the points. It may also depend on constants of the camera and on displacements of points.
-    ``expected`` (3,): the predicted pose with which the points were identified. ``held``: the values (P,) and the
+    ``expected`` (3,): the predicted robot pose at which the points were identified. ``held``: the values (P,) and the
     covariance (P, P) of the camera's constants if :meth:`on_pose` has fixed them, otherwise None.
     """
 
@@ -54,8 +54,8 @@ class PixelObservation(ResidualObservation):
 
     @classmethod
     def of(cls, t: float, seen: ReprojectionFactor, blocks: tuple[str, ...], expected: Array) -> Self:
-        """Return the observation with the factor ``seen``, which depends on the pose and on the state ``blocks``.
-        ``expected`` (3,): the predicted pose."""
+        """Return the observation with the factor ``seen`` at the time ``t`` [s]. ``blocks``: the names of the state
+        blocks that the factor depends on. ``expected`` (3,): the predicted pose of the robot."""
         return cls(t, (Term(seen, blocks, seen.dof()),), seen, expected)
 
     def correct(
@@ -88,8 +88,8 @@ class PixelObservation(ResidualObservation):
         return reprojection.log_likelihood(factor.model, poses, factor.points, factor.pixels, tilts, covariances)
 
     def on_pose(self, values: Blocks, spreads: Blocks) -> Self:
-        """Return an observation that depends on the pose only. The camera's constants and the displacements of points
-        are fixed at ``values``, with covariances ``spreads``, which are added to the noise."""
+        """Return an observation that depends on the pose only. ``values``: estimates of the camera's constants and of
+        displacements of points, by block. ``spreads``: their covariances by block, which are added to the noise."""
         if not self.blocks:
             return self
         seen, held, blocks = self.seen, None, self.blocks
@@ -107,7 +107,7 @@ class PixelObservation(ResidualObservation):
 
 
 class CameraSensor(Sensor):
-    """A camera in a run. The attribute ``points`` identifies points of the map and rejects outliers."""
+    """A camera that detects points of the map. The attribute ``points`` identifies them and rejects outliers."""
 
     modality = "camera"
     lost = "points in images were not where they were expected"
@@ -187,8 +187,11 @@ class CameraSensor(Sensor):
 
 
 def displaced_by(factor: ReprojectionFactor, which: list[int]) -> ReprojectionFactor:
-    """Return a copy of ``factor`` that also depends on displacements of points from the map. ``which`` (K): the number
-    of the displacement of each point, or -1 for none. The displacement replaces the survey noise of the point."""
+    """Return a copy of ``factor`` that also depends on displacements of points from the map.
+
+    ``which`` (K): for each of K points, the index of its displacement among the factor's displacement variables, or -1.
+    A displacement replaces the survey noise of the point.
+    """
     covariances = factor.point_covariances
     if covariances is not None:
         covariances = np.where(np.array(which)[:, None, None] < 0, covariances, 0.0)
@@ -237,12 +240,12 @@ class PixelFinder:
 
     @property
     def newest(self) -> ChainState | None:
-        """The odometry state at the last image from which a pose was found, or None."""
+        """The odometry state at the last image with a computed pose, or None."""
         return self._fixes[-1].odometry if self._fixes else None
 
     @property
     def hypotheses(self) -> tuple[Mode, ...]:
-        """The pose from the last image as the only hypothesis, or () if no pose was found."""
+        """The pose from the last image with a computed pose as the only hypothesis, or () if there is no such image."""
         if not self._fixes:
             return ()
         last = self._fixes[-1]
@@ -250,14 +253,14 @@ class PixelFinder:
 
     @property
     def best(self) -> PosePrior | None:
-        """The pose from the last image if it is reliable or if previous images agree with it, otherwise None."""
+        """The pose from the last image if it is reliable or agrees with poses from previous images, otherwise None."""
         if not self._fixes or not (self._fixes[-1].clear or self._agree()):
             return None
         last = self._fixes[-1]
         return PosePrior(last.odometry.t, last.pose, se2.body_to_world(last.pose, last.covariance))
 
     def _suspicious_since(self) -> float | None:
-        """Return the time [s] since which points are missing in all images, or None if this time is too short."""
+        """Return the time [s] since which map points are missing in all images, or None if this time is too short."""
         poor: list[float] = []
         for t, missed in reversed(self._stamps):
             if not missed:
@@ -272,8 +275,9 @@ class PixelFinder:
     def refuted_since(self, m: Pixels, odometry: ChainState, pose: Array, covariance: Array) -> float | None:
         """Return the time [s] since which the estimated pose has been wrong, or None if the estimate may be right.
 
-        Call this after an estimator has processed the image ``m``. The estimated ``pose`` (3,) at ``odometry`` is wrong
-        if points of the map are missing in the last images, and if these images agree on another pose.
+        Call this after an estimator has processed the image ``m``. ``pose`` (3,): the estimate at the state
+        ``odometry``. It is wrong if points of the map are missing in the last images, and if these images agree on
+        another pose.
         """
         self._stamps = [s for s in self._stamps if s[0] < m.t]
         self._stamps.append((m.t, self._points.missed))
@@ -288,7 +292,8 @@ class PixelFinder:
         return since if self._agree() else None
 
     def look(self, m: Pixels, odometry: ChainState) -> bool:
-        """Find the pose from the image ``m``, taken at the odometry state ``odometry``. Returns False if this fails."""
+        """Compute the robot's pose from the image ``m``. ``odometry``: the odometry state at the image. Returns False
+        without a pose."""
         if not self._fixes and m.t < self._fruitless + SEARCH_INTERVAL and m.t >= self._fruitless:
             return False
         self._fixes = [f for f in self._fixes if m.t - KEPT <= f.odometry.t < m.t]
@@ -305,7 +310,8 @@ class PixelFinder:
         return True
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
-        """Return ``count`` random poses (N, 3), drawn from the Gaussian of the pose from the last image."""
+        """Return ``count`` random poses (N, 3), drawn from the Gaussian of the pose from the last image. At least one
+        successful :meth:`look` is required."""
         last = self._fixes[-1]
         body = last.covariance + LEAST
         return np.asarray(se2.compose(last.pose, se2.exp(rng.multivariate_normal(np.zeros(3), body, count))))

@@ -20,7 +20,7 @@ OBLIQUE = math.radians(75.0)  # a point is detected if the angle between line of
 
 
 def simulate(ride: Ride) -> Simulated:
-    """Return the simulated detections of named points on a drive, which are empty if the world has no points."""
+    """Return the simulated detections of named points on a drive. The result is empty if the world has no points."""
     if ride.world.points is None:
         return Simulated()
     settings, camera = ride.settings.pixels, ride.rig.of(CameraSettings)
@@ -42,8 +42,9 @@ def pixel_stream(
 ) -> SightingStream:
     """Return simulated detections of points in images taken at ``times`` (N,) [s] from robot ``poses`` (N, 3).
 
-    A point is detected if it is inside the image, within range, not occluded, and not on a surface that the camera
-    views too obliquely. Walls and furniture occlude points at any height. ``rng``: draws noise and outliers.
+    A point is detected if it is inside the image, within range, not occluded, and not viewed too obliquely. Walls and
+    furniture occlude points at any height. ``settings``: maximum number of points per image, and fraction of outliers.
+    ``rng``: draws noise and outliers.
     """
     points = world.points
     assert points is not None, "the world has points"
@@ -71,8 +72,8 @@ def pixel_stream(
 
 
 def surface_normals(world: World, places: Array) -> Array:
-    """Return the unit normals (K, 2) of the walls nearest to ``places`` (K, 2), on the side of these positions. Returns
-    zeros if the world has no walls."""
+    """Return the unit normals (K, 2) of the walls nearest to ``places`` (K, 2) [m]. A normal points to the side of the
+    wall with this position. Returns zeros if the world has no walls."""
     if not world.walls:
         return np.zeros((len(places), 2))
     walls = np.array(world.walls, dtype=float).reshape(-1, 2, 2)[nearest_walls(world, places)[1]]
@@ -83,8 +84,8 @@ def surface_normals(world: World, places: Array) -> Array:
 
 
 def _at_most(count: int, frames: Array, rng: np.random.Generator) -> Array:
-    """Select at most ``count`` rows of each image at random. Returns the sorted indices of the rows. ``frames`` (K,):
-    the image number of each row, sorted."""
+    """Return the sorted indices of at most ``count`` rows of each image, selected at random. ``frames`` (K,): the image
+    number of each row, sorted."""
     shuffled = np.lexsort((rng.random(len(frames)), frames))
     starts = np.searchsorted(frames, frames)
     return np.sort(shuffled[np.arange(len(frames)) - starts < count])

@@ -67,8 +67,8 @@ class PixelSummary:
 
 
 def summarize(log: Log) -> Summary:
-    """Return the summary of the camera in a log, with warnings. Its entry ``images`` is an :class:`ImageSummary` or
-    None, its entry ``pixels`` a :class:`PixelSummary` or None."""
+    """Return the summary of the camera in a log, with warnings. Its entry ``images`` is an :class:`ImageSummary`, its
+    entry ``pixels`` is a :class:`PixelSummary`. Each is None if the log has no such data."""
     images, pixels = summarize_images(log), summarize_pixels(log)
     text = []
     if images is not None:
@@ -181,8 +181,8 @@ APART = 0.5  # maximum difference of the downward component of the optical axis 
 
 
 def mounting_problems(log: Log) -> list[Notice]:
-    """Return a list with a warning if images rotate differently than by the mounting of the camera in the rig. Returns
-    [] otherwise, and if the log lacks a camera, reference headings, or enough usable images."""
+    """Return a list with a warning if the images rotate in another way than the camera's mounting in the rig predicts.
+    Returns [] otherwise, and if the log lacks a camera, reference headings, or enough usable images."""
     stream, camera = log.streams.get("camera"), log.rig.find(CameraSettings)
     if not isinstance(stream, ImageStream) or camera is None or log.reference is None or not log.reference.has_heading:
         return []
@@ -203,8 +203,8 @@ def mounting_problems(log: Log) -> list[Notice]:
 
 
 def _turns(log: Log, stream: ImageStream) -> Iterator[tuple[float, float]]:
-    """Yield (rotation of the robot, rotation of the image) [rad] for pairs of successive images between which the robot
-    rotates much. Pairs are skipped if the rotation of the image cannot be estimated."""
+    """Yield (rotation of the robot, rotation of the image) [rad] for pairs of successive images with a large rotation
+    of the robot. Pairs are skipped if the rotation of the image cannot be estimated."""
     assert log.reference is not None
     headings = log.reference.at(stream.t + log.rig.time_offset("camera"))[:, 2]
     turns = se2.wrap(np.diff(headings))
@@ -240,7 +240,7 @@ JPEG_QUALITY = 90
 
 
 def draw(log: Log) -> Marks:
-    """Return the marks of the points of the map for plots and viewers."""
+    """Return the points of the map for plots and viewers."""
     points = log.world.points
     positions = np.empty((0, 3)) if points is None else points.positions
     return Marks(

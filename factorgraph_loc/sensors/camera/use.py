@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 def check(use: Use) -> Use:
-    """Return the run ``use``, changed so that points are estimated if the map has no points for the camera.
+    """Return the run ``use``. Its settings are changed to estimate points if the map has no points for the camera.
 
     The change is the setting ``landmarks`` = "unknown" and a warning. It is only made if the user has not set
     ``landmarks``, the estimator can estimate points, and the run has no other exteroceptive sensors.
@@ -46,13 +46,13 @@ def check(use: Use) -> Use:
 
 
 def review(use: Use, _ending: Ending) -> Review:
-    """Return the camera's review of a run: warnings if the points of the map cannot be used as the settings require."""
+    """Return warnings if the points of the map cannot be used as the settings of the run require."""
     return Review(tuple(_doubts(use)))
 
 
 def _doubts(use: Use) -> Iterator[Notice]:
-    """Yield a warning if the run needs points and the map has none, or if the settings ask for points to be estimated
-    and the estimator cannot do this."""
+    """Yield a warning if the run needs points and the map has none. Yield a warning if the settings require to estimate
+    points and the estimator cannot."""
     landmarks = getattr(use.settings, "landmarks", "known")
     if _has_points(use):
         if landmarks == "unknown" and not use.estimates_points:
@@ -78,8 +78,8 @@ def _has_points(use: Use) -> bool:
 
 @dataclass(frozen=True)
 class PreparedLog:
-    """A log with features instead of images. ``images``: the number of images in which features were detected.
-    ``seconds``: the duration of feature detection. Both are 0 if no features were needed."""
+    """A log with features instead of images. ``images``: the number of images with feature detection. ``seconds``: the
+    duration of feature detection. Both are 0 if no features were needed."""
 
     log: Log
     warnings: tuple[Notice, ...] = ()
@@ -90,7 +90,7 @@ class PreparedLog:
 def frontend_of(rig: Rig, world: World) -> FrontendSettings:
     """Return the settings of feature detection in ``rig``, with the kind of feature of the points in the map ``world``.
 
-    If the map has no points, features are spread over the image, because the strongest may be on a moving object.
+    If the map has no points, features are distributed over the image, because the strongest may be on a moving object.
     """
     camera = rig.find(CameraSettings)
     settings = FrontendSettings() if camera is None else camera.frontend
@@ -109,8 +109,8 @@ def frames_of(log: Log) -> tuple[Array, Sequence[CameraFrame]]:
 
 
 def prepare(use: Use, progress: Callable[[float], None]) -> PreparedLog:
-    """Return the log of a run with features instead of images. If the estimator does not use images, no features are
-    detected. ``progress`` is called with the completed fraction."""
+    """Return the log of the run ``use`` with features instead of images. If the estimator does not use images, no
+    features are detected. ``progress`` is called with the completed fraction."""
     log, stream = use.log, use.log.streams.get("camera")
     if "camera" not in use.sensors or not isinstance(stream, ImageStream):
         return PreparedLog(log)

@@ -49,7 +49,7 @@ class Sightings:
 
     ``t`` (K,): timestamps [s] by the sensor's clock. ``points`` (K, 2): positions of the landmarks [m] in the world
     frame, or (K, 3) with heights above the sensor. ``ranges`` (K,) [m], ``bearings`` (K,) [rad]: NaN if not measured.
-    ``sound`` (K, 2): the probabilities that the range and the bearing are inliers.
+    ``sound`` (K, 2): for each range and each bearing, the probability that it is an inlier.
     """
 
     log: Log
@@ -60,8 +60,9 @@ class Sightings:
     sound: Array
 
     def whitened(self, settings: BearingRangeSettings, moved: Array | float = 0.0) -> Array:
-        """Return range and bearing residuals (K, 2), predicted minus measured, in standard deviations. Residuals are 0
-        if not measured. ``moved`` (3,): a body-frame perturbation that is applied to all reference poses."""
+        """Return the residuals (K, 2) of ranges and bearings, predicted minus measured, in standard deviations.
+        Residuals of missing values are 0. ``settings``: the sensor model. ``moved`` (3,): a body-frame perturbation
+        that is applied to all reference poses."""
         assert self.log.reference is not None
         poses = self.log.reference.at(self.t + settings.time_offset)
         if np.any(moved):
@@ -69,11 +70,12 @@ class Sightings:
         return bearing_range.residuals(settings.model(), poses, self.points, self.ranges, self.bearings)
 
     def residuals(self, settings: BearingRangeSettings, moved: Array | float = 0.0) -> Array:
-        """Return :meth:`whitened` residuals (K, 2), multiplied by the square root of ``sound``."""
+        """Return :meth:`whitened` residuals (K, 2), multiplied by the square root of the inlier probabilities
+        ``sound``."""
         return np.sqrt(self.sound) * self.whitened(settings, moved)
 
     def errors(self, settings: BearingRangeSettings) -> Array:
-        """Return range and bearing residuals (K, 2) [m, rad], predicted minus measured, NaN if not measured."""
+        """Return residuals (K, 2) of ranges [m] and bearings [rad], predicted minus measured, NaN if not measured."""
         out = self.whitened(settings) * bearing_range.sigmas(settings.model(), self.ranges)
         out[np.isnan(self.ranges), 0] = np.nan
         out[np.isnan(self.bearings), 1] = np.nan
@@ -81,13 +83,14 @@ class Sightings:
 
 
 def separated(errors: Array, ranges: Array) -> tuple[tuple[float, float], Array]:
-    """Estimate the standard deviation of the inliers among ``errors`` (K,), which may include gross errors and NaN.
+    """Return the standard deviation of the inliers among ``errors`` (K,), and their probabilities (K,) of being
+    inliers.
 
-    Returns (constant, relative), and the probability (K,) that each error is an inlier. The standard deviation at range
-    r is sqrt(constant^2 + (relative r)^2). ``ranges`` (K,): measured ranges [m].
+    The standard deviation is a pair (constant, relative). At range r it is sqrt(constant^2 + (relative r)^2).
+    ``errors`` may include gross errors and NaN. ``ranges`` (K,): measured ranges [m].
 
-    A mixture of two zero-mean Gaussians is fitted by expectation-maximisation, which starts from the median absolute
-    error (McLachlan and Peel, "Finite mixture models", 2000, section 3.2). The wider Gaussian models the gross errors.
+    A mixture of two zero-mean Gaussians is fitted by expectation-maximisation (McLachlan and Peel, "Finite mixture
+    models", 2000, section 3.2). It starts from the median absolute error. The wider Gaussian models the gross errors.
     """
     known = np.isfinite(errors)
     error, distance = errors[known], ranges[known]
@@ -127,8 +130,9 @@ class LandmarkCalibrator(ConstantsCalibrator):
     first, rounds = FIRST, 4
 
     def part(self, log: Log) -> Sightings:
-        """Return the sightings of mapped landmarks during the reference, without its first and last ``MAX_OFFSET``
-        seconds. At most about ``MOST_SIGHTINGS`` are returned. Raises InputError for fewer than ``MIN_SIGHTINGS``."""
+        """Return the sightings of mapped landmarks with a reference pose. Sightings in the first and last
+        ``MAX_OFFSET`` seconds of the reference are omitted. The number is reduced to about ``MOST_SIGHTINGS``. Raises
+        InputError for fewer than ``MIN_SIGHTINGS``."""
         stream, reference = log.streams["bearing_range"], log.reference
         assert isinstance(stream, BearingRangeStream)
         assert reference is not None
@@ -167,8 +171,8 @@ class LandmarkCalibrator(ConstantsCalibrator):
     def with_noise(
         self, parts: Sequence[Sightings], settings: BearingRangeSettings
     ) -> tuple[Sequence[Sightings], BearingRangeSettings]:
-        """Estimate the noise without gross errors. Returns the sightings with new probabilities ``sound``, and the
-        settings with new noise."""
+        """Return the sightings with new inlier probabilities ``sound``, and the settings with new noise. The noise is
+        estimated without gross errors."""
         errors = np.concatenate([part.errors(settings) for part in parts])
         ranges = np.nan_to_num(np.concatenate([part.ranges for part in parts]))
         sigmas, sound = dict[str, float](), np.ones(errors.shape)
@@ -186,7 +190,8 @@ class LandmarkCalibrator(ConstantsCalibrator):
     ) -> tuple[Sequence[Sightings], BearingRangeSettings, Posterior | None]:
         """Return ``parts`` and ``settings``, both updated with the best fit, and the posterior of the constants.
 
-        The fit is repeated with the other ``range_kind``, distance or depth. The better of the two fits is returned.
+        ``parts``: the sightings of each log. The fit is repeated with the other ``range_kind``, distance or depth. The
+        better of the two fits is returned. The posterior is None if no constants are estimated.
         """
         given = super().estimated(parts, settings)
         if not any(np.any(np.isfinite(part.ranges) & np.isfinite(part.bearings)) for part in parts):
@@ -197,8 +202,8 @@ class LandmarkCalibrator(ConstantsCalibrator):
         return changed if new < BETTER_KIND * old else given
 
     def finished(self, parts: Sequence[Sightings], rig: Rig, knowledge: SensorKnowledge) -> SensorKnowledge:
-        """Return the result with enlarged noise, because the errors in a time window are correlated. See
-        :func:`pose_share`."""
+        """Return ``knowledge``, the fitted constants, with enlarged noise, because the errors in a time window are
+        correlated. See :func:`pose_share`. ``rig``: the rig with these constants."""
         scatter: BearingRangeSettings = rig.bearing_range
         factor = pose_share(parts, scatter) ** -0.5
         wider = {name: factor * getattr(scatter, name) for name in SIGMAS}
@@ -221,8 +226,8 @@ CALIBRATOR = LandmarkCalibrator()
 
 
 def pose_share(parts: Sequence[Sightings], settings: BearingRangeSettings) -> float:
-    """Return the information of the sightings on the pose, divided by the information if all errors were independent.
-    The result is at most 1. See :func:`independent_share`."""
+    """Return the Fisher information of the sightings on the pose, divided by its value for independent errors. The
+    result is at most 1. ``parts``: the sightings of each log. See :func:`independent_share`."""
 
     def residuals(moved: Array) -> Array:
         return np.concatenate([part.residuals(settings, moved) for part in parts])

@@ -43,8 +43,8 @@ ACCURATE, SHARE = 0.3, 0.15  # maximum standard deviation: the larger of ACCURAT
 
 
 class PartialSighting(NamedTuple):
-    """A sighting of a landmark with ``range`` [m] alone or ``bearing`` [rad] alone. The other value is NaN.
-    ``odometry``: the odometry state at the time of the sighting."""
+    """A sighting of a landmark with either ``range`` [m] or ``bearing`` [rad]. The other value is NaN. ``odometry``:
+    the odometry state at the time of the sighting."""
 
     odometry: ChainState
     range: float
@@ -66,10 +66,10 @@ class LocatedPoint(NamedTuple):
 
 @dataclass(frozen=True)
 class Candidate:
-    """All sightings of one landmark with an unknown position. Immutable.
+    """The sightings of one landmark with an unknown position. Immutable.
 
     ``sightings``: in order of time. ``sources``: the object that the caller passed with each sighting. ``due``: the
-    number of sightings that the next attempt to locate the landmark needs.
+    number of sightings that the next attempt to locate the landmark requires.
     """
 
     sightings: tuple[PartialSighting, ...] = ()
@@ -77,8 +77,8 @@ class Candidate:
     due: float = FEWEST
 
     def plus(self, sighting: PartialSighting, source: object) -> Candidate:
-        """Return a copy with a further sighting. ``source``: an object that is stored with the sighting. The previous
-        sighting is discarded if the robot had moved less than APART before it."""
+        """Return a copy with the further ``sighting``. ``source``: any object, stored with the sighting. The previous
+        sighting is replaced if the robot has moved less than APART [m] since the one before it."""
         end = len(self.sightings)
         if end > 1:
             previous, last = (np.array(s.odometry[1:3]) for s in self.sightings[-2:])
@@ -92,7 +92,7 @@ class Candidate:
         return len(self.sightings) >= self.due
 
     def tried(self) -> Candidate:
-        """Return a copy for which the next attempt needs more sightings. Call this after a failed attempt."""
+        """Return a copy that requires more sightings for the next attempt to locate the landmark."""
         return replace(self, due=min(GROWTH * len(self.sightings), MOST))
 
     def position(
@@ -101,7 +101,7 @@ class Candidate:
         """Return the estimated position of the landmark, or None if no position or several positions fit the sightings.
 
         ``model``: the model of the sensor. ``motion``: the odometry. ``constants`` (P,) with covariance ``uncertainty``
-        (P, P): estimated calibration constants of the odometry.
+        (P, P): estimated calibration constants of the odometry, P = 0 if none is estimated.
         """
         path = _PathSightings(model, self.sightings, motion, constants, uncertainty)
         if path.count < FEWEST:
@@ -154,8 +154,8 @@ class _PathSightings:
         self._common += np.einsum("iap,pq,jbq->ijab", turns, uncertainty, turns)
 
     def positions(self) -> list[LocatedPoint]:
-        """Return possible positions of the landmark, sorted by loss. They are the local optima, and one optimum that is
-        found from the mirror image of the best one."""
+        """Return possible positions of the landmark, sorted by loss. They are the local optima, and one optimum that
+        starts at the mirror image of the best one."""
         starts = self._starts()
         points = self._refined(starts)
         points = points[np.argsort(self._losses(points))]

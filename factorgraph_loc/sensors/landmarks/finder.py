@@ -65,8 +65,8 @@ SEARCH_INTERVAL = 1.0  # s between searches while the estimated pose is suspicio
 class Hypothesis(Mode):
     """A possible pose of the robot, as a Gaussian. Its ``weight`` is its posterior probability.
 
-    ``explained``: the number of inliers among the sightings at this pose. ``share``: the fraction of inliers.
-    ``landmarks``: the number of different landmarks among the inliers.
+    ``explained``: the number of sightings that are inliers at this pose. ``share``: the fraction of sightings that are
+    inliers. ``landmarks``: the number of different landmarks among the inliers.
     """
 
     explained: int
@@ -77,10 +77,9 @@ class Hypothesis(Mode):
 class LandmarkFinder:
     """Global localization by landmarks of the map. It implements :class:`~factorgraph_loc.sensors.base.Finder`.
 
-    ``factor``: a function from a measurement to the factor of its mapped landmarks, or to None if it has no such
-    landmarks. ``positions`` (L, 2): the positions of the landmarks in the map.
-    ``hypotheses``: the results of the last search, most likely first.
-    ``best``: the pose at the last sighting if one hypothesis is unambiguous, otherwise None.
+    ``factor``: a function that returns the factor of the mapped landmarks in a measurement, or None if there are none.
+    ``positions`` (L, 2): the positions of the landmarks in the map. ``hypotheses``: the result of :meth:`search`, most
+    likely first. ``best``: the pose at the last sighting if it is unambiguous, otherwise None.
     """
 
     at_once = False
@@ -132,7 +131,7 @@ class LandmarkFinder:
         self._monitor.clear()
 
     def add(self, odometry: ChainState, factor: BearingRangeFactor) -> None:
-        """Store the sightings in ``factor``, made at the odometry state ``odometry``."""
+        """Store the sightings in ``factor``. ``odometry``: the odometry state at their time."""
         self._model = factor.model
         points, ranges = factor.points[:, :HEIGHT], on_floor(factor.model, factor.points, factor.ranges)
         places, values = points.tolist(), zip(ranges.tolist(), factor.bearings.tolist(), strict=True)
@@ -149,7 +148,7 @@ class LandmarkFinder:
                 del self._sightings[key]
 
     def search(self) -> None:
-        """Search for the pose at the time of the last sighting. Sets ``hypotheses`` and ``best``."""
+        """Set ``hypotheses`` and ``best``, the possible poses at the last sighting, from all stored sightings."""
         rows = sorted((r for rows in self._sightings.values() for r in rows), key=lambda r: r.odometry.t)[-ROWS:]
         earlier, previous = self.hypotheses, self._window
         self.hypotheses, self.best, self._window = (), None, None
@@ -191,11 +190,8 @@ class LandmarkFinder:
         return np.concatenate(poses)
 
     def refutes(self, pose: Array, covariance: Array) -> bool:
-        """Return True if an estimated pose must be wrong, because ``best`` explains nearly all sightings, and many more
-        than the estimated pose does.
-
-        ``pose`` (3,) with body-frame ``covariance`` (3, 3): the estimated pose at the last sighting.
-        """
+        """Return True if the estimated pose is wrong, because ``best`` explains nearly all sightings, and many more
+        than this pose. ``pose`` (3,) with body-frame ``covariance`` (3, 3): the estimate at the last sighting."""
         if self.best is None or self._window is None:
             return False
         if self.hypotheses[0].share < REFUTING_SHARE or self.hypotheses[0].landmarks < REFUTING_LANDMARKS:
@@ -244,8 +240,8 @@ class LandmarkFinder:
         )
 
     def _unambiguous(self, window: SightingWindow) -> PosePrior | None:
-        """Return the most likely hypothesis if it is unambiguous, otherwise None. It is refined with correlated
-        odometry errors."""
+        """Return the most likely hypothesis if it is unambiguous, otherwise None. The returned pose is refined with
+        correlated odometry errors."""
         if not self.hypotheses:
             return None
         best = self.hypotheses[0]
@@ -270,8 +266,8 @@ def _time(row: Sighting) -> float:
 
 
 def _insert(rows: list[Sighting], row: Sighting) -> None:
-    """Insert the sighting ``row`` into ``rows``, the sightings of the same landmark in order of time. Sightings that
-    are less than INTERVAL after the previous one are removed, except the last."""
+    """Insert the sighting ``row`` into ``rows``, the sightings of the same landmark in order of time. Sightings less
+    than INTERVAL [s] after the previous one are removed, except the last one."""
     if rows and row.odometry.t <= rows[-1].odometry.t:
         rows[:] = [r for r in rows if r.odometry.t != row.odometry.t]
         rows.append(row)
@@ -314,7 +310,7 @@ def _distance(pose: Array, mean: Array, covariance: Array) -> float:
 
 
 class TrackMonitor:
-    """Detects that most of the last sightings contradict the estimated pose. The pose or the map may be the reason.
+    """Detects that most of the last sightings contradict the estimated pose, because the pose or the map is wrong.
 
     ``suspicious_since``: the time [s] since which the sightings contradict the pose, or None.
     """
@@ -337,12 +333,12 @@ class TrackMonitor:
         self.suspicious_since = self._beginning() if lasts else None
 
     def clear(self) -> None:
-        """Discard all counts, because the estimated pose was replaced or confirmed."""
+        """Discard all counts. Call this if the estimated pose was replaced or confirmed."""
         self._stamps.clear()
         self.suspicious_since = None
 
     def _beginning(self) -> float:
-        """Return the time [s] that best separates agreeing landmarks from later contradicting landmarks."""
+        """Return the time [s] that best separates agreeing landmarks from later landmarks that contradict the pose."""
         excess = np.array([2 * beyond - count for _, beyond, count in self._stamps])
         return self._stamps[int(np.argmax(np.cumsum(excess[::-1])[::-1]))][0]
 

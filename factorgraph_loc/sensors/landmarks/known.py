@@ -26,9 +26,10 @@ class KnownLandmarks:
 
     ``use``: how the map is used. "known": landmarks that are not in the map are ignored. "extended": they are
     estimated. "unknown": all landmarks are estimated, and only their heights are taken from the map. ``estimated``:
-    indices of the sensor's constants that are estimated. ``carries``: True to estimate mapped landmarks with an inexact
-    survey. Otherwise the covariance of the survey is added to the noise. ``locates``: True if the estimator can locate
-    new landmarks from ranges alone or bearings alone. ``biased``: True to estimate a range bias of each landmark.
+    indices of the sensor's constants that are estimated. ``carries``: True if the positions of mapped landmarks with an
+    inexact survey are part of the state. Otherwise the covariance of the survey is added to the noise. ``locates``:
+    True if the estimator can locate new landmarks from ranges alone or bearings alone. ``biased``: True to estimate a
+    range bias of each landmark.
     """
 
     def __init__(
@@ -60,8 +61,8 @@ class KnownLandmarks:
         self._diagnostics = diagnostics
 
     def factor(self, m: BearingRange) -> BearingRangeFactor | None:
-        """Return one factor of all landmarks in ``m`` that are in the map and not estimated, or None without such
-        landmarks. The factor depends on the pose at the time of ``m``."""
+        """Return one factor of all mapped landmarks in ``m`` that are not estimated, or None without such landmarks.
+        The factor depends on the pose at the time of ``m``."""
         return self.factors(m)[0]
 
     def factors(
@@ -123,7 +124,7 @@ class KnownLandmarks:
         return factor, *single_factors
 
     def _usable(self, m: BearingRange) -> tuple[list[int], list[int], list[int], list[int]]:
-        """Return the row numbers of the landmarks in ``m`` for each of the four groups of :meth:`factors`. Other rows
+        """Return four lists: the row numbers of the landmarks in ``m`` for each group of :meth:`factors`. Other rows
         are counted in the diagnostics."""
         fixed, single, surveyed, unknown = list[int](), list[int](), list[int](), list[int]()
         rows = zip(m.landmarks, m.range.tolist(), m.bearing.tolist(), strict=True)
@@ -145,5 +146,5 @@ class KnownLandmarks:
         return fixed, single, surveyed, unknown
 
     def survey(self, name: str) -> tuple[Array, Array]:
-        """Return the surveyed position (2,) and its covariance (2, 2) of a mapped landmark with an inexact survey."""
+        """Return the position (2,) [m] and covariance (2, 2) of the landmark ``name``, which has an inexact survey."""
         return self._positions[name][:2], self._surveys[name]

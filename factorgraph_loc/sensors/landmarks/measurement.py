@@ -189,8 +189,8 @@ class Landmark(FileModel):
 
 
 def points_of(landmarks: Iterable[Landmark], z: float) -> Array:
-    """Return the positions (K, 2) of landmarks if all are at the height ``z`` [m] of the sensor. Otherwise return (K,
-    3) with the height above the sensor in the last column."""
+    """Return the positions (K, 2) [m] of K landmarks at the height ``z`` [m] of the sensor. If one has another height,
+    return (K, 3) with the height above the sensor in the last column."""
     places = np.array([(mark.x, mark.y, mark.z - z) for mark in landmarks]).reshape(-1, 3)
     return places if places[:, 2].any() else np.ascontiguousarray(places[:, :2])
 
@@ -212,7 +212,7 @@ def read_layer(content: Any, source: object, folder: Path) -> Any:
     """Return the landmarks of a world file. If its section ``landmarks`` names a table, they are read from the table.
 
     ``content``: the section. For a table, it assigns columns to the fields landmark, x, y and optionally z, and to
-    sigma or both sigma_x and sigma_y, of which the larger value is used. ``source``: the name of the world file in
+    sigma or both sigma_x and sigma_y. The larger of the two is used. ``source``: the name of the world file in
     messages. ``folder``: the folder of the table. Raises InputError for an invalid value or a duplicate name.
     """
     if not isinstance(content, dict) or not isinstance(content.get("file"), str):

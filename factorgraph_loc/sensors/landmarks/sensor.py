@@ -57,10 +57,7 @@ MAX_PENDING = 5  # maximum number of stored sightings of a new landmark, of whic
 @dataclass(frozen=True)
 class LandmarkObservation(ResidualObservation):
     """The observation of one measurement of landmarks. One term contains all landmarks with a known position. Each
-    other landmark has its own term.
-
-    ``surveyed``: True if the position of a surveyed landmark is estimated.
-    """
+    other landmark has its own term. ``surveyed``: True if the position of a surveyed landmark is estimated."""
 
     surveyed: bool = False
 
@@ -124,7 +121,7 @@ class LandmarkObservation(ResidualObservation):
         return frozenset(map(tuple, self.measured.points.tolist()))
 
     def at_its_time(self) -> Self | None:
-        """Return an observation that depends only on the pose at the time ``t``, or None if it depends on blocks."""
+        """Return an observation that depends on the pose at its time ``t`` alone, or None if it depends on blocks."""
         if self.blocks:
             return None
         factor = self.measured
@@ -133,8 +130,9 @@ class LandmarkObservation(ResidualObservation):
         )
 
     def on_pose(self, values: Blocks, spreads: Blocks) -> Self:
-        """Return an observation that depends on the pose only, with all blocks fixed at ``values``. Its noise includes
-        the covariances ``spreads`` of landmarks and range biases, but not those of calibration constants."""
+        """Return an observation that depends on the pose only. ``values``: the estimates (d,) of all blocks by name.
+        ``spreads``: their covariances (d, d) by name. Those of landmarks and range biases are added to the noise, those
+        of calibration constants are not."""
         if len(self.terms) == 1 and not self.terms[0].blocks:
             return self
         fixed = []
@@ -158,11 +156,10 @@ Sighted = tuple[float, LandmarkObservation]  # the observation, after the time [
 
 @dataclass(frozen=True)
 class NewLandmarks:
-    """Stored sightings of landmarks with unknown positions, by the name of the landmark's state block. Immutable.
+    """Stored sightings of landmarks that are not yet in the state, by the name of the landmark's state block.
 
     ``pending``: sightings with range and bearing: the position (2,) of the landmark, its covariance (2, 2), and the
-    observation. Two of them must agree before the landmark is added to the state. ``partial``: sightings with range
-    alone or bearing alone.
+    observation. Two of them must agree before the landmark is added to the state. ``partial``: other sightings.
     """
 
     pending: Mapping[str, tuple[tuple[Array, Array, Sighted], ...]] = field(default_factory=dict)
@@ -176,11 +173,11 @@ class NewLandmarks:
     def propose(
         self, name: str, point: Array, covariance: Array, sighting: Sighted
     ) -> tuple[NewLandmarks, Sighted | None]:
-        """Compare a new sighting with the stored sightings of the landmark ``name``.
+        """Compare a new sighting with the stored sightings of the landmark ``name``. Returns two values.
 
-        ``point`` (2,), ``covariance`` (2, 2): the position of the landmark from the new sighting. If a stored sighting
-        agrees with it, returns a copy without this landmark, and the stored sighting. Otherwise returns a copy that
-        also contains the new sighting, and None.
+        ``point`` (2,), ``covariance`` (2, 2): the position of the landmark from the new ``sighting``. If a stored
+        sighting agrees with it: a copy without this landmark, and the stored sighting. Otherwise: a copy that also
+        contains the new sighting, and None.
         """
         waiting = self.pending.get(name, ())
         for earlier, noise, candidate in reversed(waiting):
@@ -192,11 +189,10 @@ class NewLandmarks:
 
 
 class LandmarkSensor(Sensor):
-    """A sensor of identified landmarks in a run. :class:`KnownLandmarks` describes how it uses the map.
+    """A sensor of identified landmarks. :class:`KnownLandmarks` describes how it uses the map.
 
     A landmark that is not in the map becomes the state block ``bearing_range/NAME``, which all landmark sensors share.
-    It is initialised when two sightings agree on its position, or when several sightings with range alone or bearing
-    alone determine it.
+    It is initialised when two sightings agree on its position, or when several ranges or bearings determine it.
     """
 
     modality = "bearing_range"
@@ -269,7 +265,8 @@ class LandmarkSensor(Sensor):
             yield NewVariable(block, np.zeros(1), np.zeros((1, 3)), {}, np.array([[self._bias**2]]), ())
 
     def _term(self, name: str, factor: BearingRangeFactor, view: View) -> Term:
-        """Return the term of the landmark ``name``. The term depends on a range bias if the state contains the bias."""
+        """Return the graph term of the landmark ``name``. It depends on the landmark's range bias if the state has
+        one."""
         block = f"{self.modality}/{name}"
         if factor.biased and view.value(f"{block}/bias") is None:
             factor = replace(factor, biased=False)
@@ -277,8 +274,8 @@ class LandmarkSensor(Sensor):
         return Term(factor, (*self._shared, *biases, *((block,) if factor.free else ())), 2)
 
     def _proposed(self, t: float, block: str, term: Term, view: View) -> NewVariable | None:
-        """Return a new landmark if two sightings with range and bearing agree on its position. Otherwise store the
-        sighting ``term`` at ``t`` [s] and return None. ``block``: the name of the landmark's state block."""
+        """Return a new state block if two sightings with range and bearing agree on the position of a landmark.
+        Otherwise store the sighting ``term`` at ``t`` [s] and return None. ``block``: the name of the block."""
         shared = [value for name in self._shared if (value := view.value(name)) is not None]
         factor = replace(cast(BearingRangeFactor, term.factor), biased=False)
         point, (by_pose, *by_shared), noise = factor.locate([view.pose, *shared])
@@ -289,8 +286,8 @@ class LandmarkSensor(Sensor):
         return None if earlier is None else replace(new, sightings=(earlier, current))
 
     def _located(self, t: float, block: str, term: Term, view: View) -> NewVariable | None:
-        """Return a new landmark if sightings with range alone or bearing alone determine its position. Otherwise store
-        the sighting ``term`` at ``t`` [s] and return None. ``block``: the name of the landmark's state block."""
+        """Return a new state block if sightings with range alone or bearing alone determine the position of a landmark.
+        Otherwise store the sighting ``term`` at ``t`` [s] and return None. ``block``: the name of the block."""
         factor = cast(BearingRangeFactor, term.factor)
         (along_floor,) = on_floor(factor.model, factor.points, factor.ranges).tolist()
         sighting = PartialSighting(self._motion.state(t), along_floor, float(factor.bearings[0]))
@@ -328,8 +325,8 @@ class LandmarkSensor(Sensor):
         return True
 
     def _learn(self, observation: LandmarkObservation, view: View) -> None:
-        """Update the estimate of late ranges (their fraction and their excess) by an observation with landmarks sighted
-        by range alone."""
+        """Update the estimated fraction and excess of late (too long) ranges. The ``observation`` must include
+        landmarks with range alone."""
         self._late_before.append((observation.t, self._late))
         while self._late_before[0][0] < observation.t - GOING_BACK:
             self._late_before.popleft()

@@ -31,7 +31,7 @@ from factors.se2 import Array
 
 
 def simulate(ride: Ride) -> Simulated:
-    """Return the simulated sightings of a drive, which are empty if the world has no landmarks."""
+    """Return the simulated landmark sightings of a drive. The result is empty if the world has no landmarks."""
     if not ride.world.landmarks:
         return Simulated()
     settings, times = ride.settings.sightings, ride.times(ride.settings.sightings.rate)
@@ -59,7 +59,7 @@ def sighting_stream(
 ) -> BearingRangeStream:
     """Return simulated sightings of all visible landmarks at ``times`` (N,) [s] from robot ``poses`` (N, 3).
 
-    ``settings``: range and field of view of the sensor. ``z``: the height of the sensor [m]. ``rng``: draws the noise.
+    ``settings``: maximum range, field of view, late ranges. ``z``: height of the sensor [m]. ``rng``: draws the noise.
     """
     points, names = points_of(world.landmarks.values(), z), list(world.landmarks)
     n, k = in_sight(model, world, poses, settings)
@@ -78,7 +78,8 @@ def sighting_stream(
 def in_sight(
     model: BearingRangeModel, world: World, poses: Array, settings: SightingSettings
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return all K pairs of a pose and a landmark that is visible from this pose, as indices (K,) and (K,).
+    """Return the indices (K,) of poses and the indices (K,) of landmarks of all K pairs in which the landmark is
+    visible.
 
     ``poses`` (N, 3): poses of the robot. A visible landmark is in range, in the field of view, and not behind a wall.
     """
@@ -125,10 +126,8 @@ def on_robot(world: World, rig: Rig, settings: Any, rng: np.random.Generator) ->
 @dataclass(frozen=True, eq=False)
 class LandmarkForecast:
     """Predicts the information of landmark sightings on candidate paths. It implements
-    :class:`~factorgraph_loc.sensors.interfaces.Forecast`.
-
-    ``looks_per_metre``: the number of measurements per metre of path. ``settings``: range and field of view.
-    """
+    :class:`~factorgraph_loc.sensors.interfaces.Forecast`. ``looks_per_metre``: the number of measurements per metre of
+    path. ``settings``: range and field of view."""
 
     world: World
     model: BearingRangeModel
@@ -138,7 +137,7 @@ class LandmarkForecast:
 
     def information(self, poses: Array, ways: Array) -> Array:
         """Return the Fisher information (N, 3, 3) of visible landmarks on ``poses`` (N, 3). ``ways`` (N,): the length
-        [m] of the path segment of each pose, to which the number of measurements is proportional."""
+        [m] of the path segment of each pose. The number of measurements is proportional to it."""
         points = self.world.positions()
         n, k = in_sight(self.model, self.world, poses, self.settings)
         pairs = poses[n], points[k], *bearing_range.predict(self.model, poses[n], points[k])
@@ -148,7 +147,7 @@ class LandmarkForecast:
         return np.asarray((self.looks_per_metre * ways)[:, None, None] * out)
 
     def add_log_weights(self, poses: Array, metres: float, stops: Places, seed: np.uint64, out: Array32) -> None:
-        """Simulate sightings from particles, and add their log-likelihoods to ``out``. See
+        """Simulate sightings from particles, and add their log-likelihoods to ``out``. For the arguments see
         :meth:`~factorgraph_loc.sensors.interfaces.Forecast.add_log_weights`."""
         sightings, scans = metres * self.looks_per_metre / len(poses), len(out)
         points = self.world.positions()
@@ -167,8 +166,8 @@ class LandmarkForecast:
 
 
 def forecast(world: World, rig: Rig, speed: float, settings: Any) -> LandmarkForecast | None:
-    """Return the forecast for a robot that drives at ``speed`` [m/s], or None without landmark sensor or landmarks.
-    ``settings``: settings of the simulation."""
+    """Return the forecast of landmark sightings of a robot that drives at ``speed`` [m/s]. Returns None without a
+    landmark sensor or landmarks. ``settings``: settings of the simulation."""
     if rig.find(BearingRangeSettings) is None or not world.landmarks:
         return None
     sightings = settings.sightings

@@ -51,7 +51,7 @@ _REFERENCE_GAP = 0.1  # s; longest interpolated gap between reference poses
 
 @dataclass(frozen=True)
 class Suspect:
-    """A landmark whose position in the map is probably wrong.
+    """A landmark with a probably wrong position in the map.
 
     ``offset`` (2,) [m]: the position from sightings minus the position in the map. ``sightings``: number of sightings.
     ``swapped_with``: the name of a landmark that seems to be interchanged with this one in the map, or None.
@@ -93,8 +93,8 @@ def summarize(log: Log) -> Summary:
 
 
 def find_suspects(log: Log) -> tuple[Suspect, ...]:
-    """Return the landmarks that are probably at a wrong position in the map, according to sightings from reference
-    poses. The position differs by more than ``MIN_OFFSET`` and five standard errors. Returns () without a reference."""
+    """Return the landmarks with a probably wrong position in the map. Their position by sightings from reference poses
+    differs by more than ``MIN_OFFSET`` [m] and by more than five standard errors. Returns () without a reference."""
     implied: dict[str, tuple[Array, int]] = {}
     for name, sightings in _seen_from_reference(log).items():
         passes = len(np.unique(sightings.t // PASS))
@@ -167,8 +167,8 @@ def _by_range_and_bearing(sightings: _Seen) -> tuple[Array, float]:
 
 
 def _by_range(sightings: _Seen, place: Array) -> tuple[Array, float]:
-    """Return the position (2,) of a landmark by robust trilateration, and its standard deviation [m] for one sighting.
-    ``place`` (2,): the initial position."""
+    """Return the position (2,) of a landmark by robust trilateration, and the standard deviation [m] of a position from
+    one sighting. ``place`` (2,): the initial position."""
 
     def residual(point: Array) -> Array:
         away: Array = sightings.sensors[:, :2] - point
@@ -272,8 +272,8 @@ def _cost(errors: Array) -> float:
 
 
 def check(use: Use) -> Use:
-    """Return ``use`` unchanged. Raises InputError if the estimator cannot locate any landmark of the log, because it
-    needs sightings with range and bearing and no sighting has both."""
+    """Return ``use`` unchanged. Raises InputError if the estimator cannot locate any landmark of the log. This is so if
+    the estimator requires sightings with range and bearing, and no sighting has both."""
     log, wanted = use.log, getattr(use.settings, "landmarks", "known")
     streams = [stream for name, stream in _streams(log).items() if name in use.sensors and len(stream.t)]
     if wanted == "known" or use.estimates_points or not streams:
@@ -296,7 +296,7 @@ def _streams(log: Log) -> dict[str, BearingRangeStream]:
 
 
 def draw(log: Log) -> Marks:
-    """Return the marks of the landmarks for plots and viewers: positions on the floor and times of sightings."""
+    """Return the landmarks of the map and the times of their sightings in ``log``, for plots and viewers."""
     places = log.world.positions()
     positions = np.column_stack((places, np.zeros(len(places))))
     stream = log.streams.get("bearing_range")
@@ -321,7 +321,7 @@ def detected(log: Log) -> Counter[str]:
 
 
 def not_located(log: Log, located: Container[str]) -> list[Notice]:
-    """Return a list with a warning that names the sighted landmarks that ``located`` lacks, or [] if it lacks none."""
+    """Return a list with a warning about sighted landmarks that are not in ``located``, or [] if all are in it."""
     missing = [f"{name} ({count} sightings)" for name, count in sorted(detected(log).items()) if name not in located]
     return (
         [notice("not_located", "landmarks that were sighted but could not be located: {landmarks}", listed(missing))]

@@ -43,7 +43,7 @@ class Sighting(NamedTuple):
 
 
 class SightingWindow:
-    """Likelihood of the present pose (at the last sighting), given K sightings, and candidates for this pose.
+    """The likelihood of the robot's pose at the last of K sightings ("present pose"), and candidates for this pose.
 
     ``rows``: the sightings in order of time. ``start``: the start of the run if its position is known, otherwise None.
     ``now``: the odometry state at the last sighting. ``points`` (K, 2): positions of the landmarks in the map.
@@ -67,11 +67,12 @@ class SightingWindow:
         self._sigmas = sigmas(model, self._ranges)
 
     def starts(self) -> Array:
-        """Return candidates (N, 3) of the present pose from the start position, or (0, 3) if the start is unknown."""
+        """Return candidates (N, 3) of the pose at the last sighting, from the start position and the odometry. Returns
+        (0, 3) if the start is unknown."""
         return np.empty((0, 3)) if self._start is None else self._start.candidates(self.now)
 
     def circles(self) -> Array:
-        """Return candidates (N, 3) of the present pose on circles around the landmark of the last sighting."""
+        """Return candidates (N, 3) of the pose at the last sighting, on circles around the sighted landmark."""
         k = len(self.points) - 1
         ranges = RADII if self._missing[k, 0] else (self._ranges[k],)
         bearings = np.arange(HEADINGS) * 2.0 * np.pi / HEADINGS if self._missing[k, 1] else (self._bearings[k],)
@@ -79,8 +80,8 @@ class SightingWindow:
         return self._poses_from(k, *(g.ravel() for g in grid))
 
     def drawn(self, rng: np.random.Generator, count: int) -> Array:
-        """Return ``count`` random samples (N, 3) of the present pose, from the known start position if there is one,
-        otherwise from the likelihood of the last sighting."""
+        """Return ``count`` random poses (N, 3) at the last sighting. They are drawn from the known start position if
+        there is one, otherwise from the likelihood of the last sighting."""
         if self._start is not None:
             return self._start.drawn(rng, count, self.now)
         k, noise = len(self.points) - 1, rng.standard_normal((2, count))
@@ -94,15 +95,16 @@ class SightingWindow:
         return self._poses_from(k, headings, ranges, bearings)
 
     def _poses_from(self, k: int, headings: Array, ranges: Array, bearings: Array) -> Array:
-        """Return the present poses (N, 3) that follow from values for the sighting ``k``. ``headings`` (N,): headings
-        of the robot at the sighting. ``ranges``, ``bearings`` (N,): range and bearing of the landmark."""
+        """Return poses (N, 3) at the last sighting that follow from sighting number ``k`` and the odometry.
+        ``headings`` (N,): robot headings at sighting ``k``. ``ranges``, ``bearings`` (N,): range and bearing of its
+        landmark."""
         turned = np.column_stack((np.zeros((len(headings), 2)), headings))
         relative = se2.transform_from(turned, located(self._model, ranges, bearings))
         return se2.compose(np.column_stack((self.points[k] - relative, headings)), self._forth[k])
 
     def alignments(self) -> Array:
-        """Return candidates (N, 3) of the present pose, one for each pair of landmarks with range and bearing. At this
-        pose the observed positions of the two landmarks are aligned with the map."""
+        """Return candidates (N, 3) of the pose at the last sighting, one for each pair of landmarks with range and
+        bearing. At this pose the observed positions of the two landmarks are aligned with the map."""
         full = [k for k in self._recent() if not self._missing[k].any()]
         pairs = np.array(list(combinations(full, 2)), dtype=int).reshape(-1, 2)
         mapped, observed = self.points[pairs], self._from_present()[pairs]
@@ -115,7 +117,7 @@ class SightingWindow:
         return np.asarray(poses[wide])
 
     def candidate_covariance(self) -> Array:
-        """Return the approximate covariance (3, 3) of the errors of candidates, which are not refined yet."""
+        """Return the approximate covariance (3, 3) of the errors of candidates that are not refined yet."""
         heading = 2.0 * np.pi / HEADINGS / 2.0 if self._missing[-1, 1] else 0.1
         distances = self._ranges[~self._missing[:, 0]]
         position = 0.1 + 0.05 * float(np.median(distances) if len(distances) else RADII[-1])
@@ -123,7 +125,7 @@ class SightingWindow:
 
     def whitener(self, noise: Array | None = None) -> Array:
         """Return matrices (K, 2, 2) that whiten the residuals of the sightings by sensor noise and odometry error.
-        ``noise`` (3, 3): an additional body-frame covariance of the present pose."""
+        ``noise`` (3, 3): an additional body-frame covariance of the pose at the last sighting."""
         error = self._drift
         if noise is not None:
             error = error + self._carried @ noise @ self._carried.transpose(0, 2, 1)
@@ -136,21 +138,22 @@ class SightingWindow:
         return positive.whitener(covariance)
 
     def squared(self, poses: Array, whitener: Array) -> Array:
-        """Return the squared norms (N, K) of the whitened residuals. ``poses`` (N, 3): present poses. ``whitener``: the
-        result of :meth:`whitener`."""
+        """Return the squared norms (N, K) of the whitened residuals of K sightings, for N ``poses`` (N, 3) at the last
+        sighting. ``whitener``: the result of :meth:`whitener`."""
         return np.asarray(np.sum((whitener @ self._residuals(poses)[..., None])[..., 0] ** 2, axis=-1))
 
     def losses(self, poses: Array, whitener: Array, noise: Array | None = None) -> Array:
-        """Return the losses (N,) of present poses ``poses`` (N, 3): robust losses of the sightings, plus the loss of a
-        known start. ``noise`` (3, 3): body-frame covariance of the poses, for the loss of the start."""
+        """Return the losses (N,) of ``poses`` (N, 3) at the last sighting: the sum of robust losses of the sightings,
+        plus the loss of a known start. ``whitener``: the result of :meth:`whitener`. ``noise`` (3, 3): body-frame
+        covariance of the poses. Only the loss of the start depends on it."""
         loss: Array = geman_mcclure_loss(self.squared(poses, whitener), self._model.robust).sum(axis=1)
         return loss if self._start is None else loss + self._start.loss(poses, self.now, noise)
 
     def refined(
         self, poses: Array, whitener: Array, iterations: int, noise: Array | None = None
     ) -> tuple[Array, Array]:
-        """Minimise :meth:`losses` from the initial values ``poses`` (N, 3) by Levenberg-Marquardt. Returns the optimal
-        poses (N, 3) and their body-frame covariances (N, 3, 3)."""
+        """Return N poses (N, 3) that minimise :meth:`losses`, and their body-frame covariances (N, 3, 3). ``poses``
+        (N, 3): the initial values. The method is Levenberg-Marquardt. For other arguments see :meth:`losses`."""
 
         def at(poses: Array, _: Integers) -> tuple[Array, Array, Array]:
             information, gradient = self._normal_equations(poses, whitener, noise)
@@ -163,10 +166,11 @@ class SightingWindow:
         return optima.states, np.asarray(np.linalg.inv(optima.curvatures))
 
     def fused(self, pose: Array, whitener: Array, iterations: int) -> tuple[Array, Array]:
-        """Refine the present pose ``pose`` (3,) by Gauss-Newton with correlated odometry errors.
+        """Return a pose (3,) and its body-frame covariance (3, 3) at the last sighting, with correlated odometry
+        errors.
 
-        Returns the pose and its body-frame covariance (3, 3). The path since the sightings is marginalised. Let e be
-        the residuals, whitened by the sensor noise, J their Jacobian by the path, and C the covariance of the path. The
+        The method is Gauss-Newton from ``pose`` (3,). The path since the sightings is marginalised. Let e be the
+        residuals, whitened by the sensor noise, J their Jacobian by the path, and C the covariance of the path. The
         covariance of e is R = I + J C J'. The residuals on the most likely path are R^-1 e.
         """
         covariances = self._covariance
@@ -206,17 +210,17 @@ class SightingWindow:
         return located(self._model, ranges, np.where(self._missing[:, 1], 0.0, self._bearings))
 
     def _from_present(self) -> Array:
-        """Return the observed positions (K, 2) of the landmarks in the present robot frame."""
+        """Return the observed positions (K, 2) of the landmarks in the robot frame at the last sighting."""
         return se2.transform_from(self._back, self._from_robot())
 
     def _residuals(self, poses: Array) -> Array:
-        """Return residuals (N, K, 2), whitened by the sensor noise, for N present ``poses`` (N, 3)."""
+        """Return residuals (N, K, 2), whitened by the sensor noise, for N ``poses`` (N, 3) at the last sighting."""
         at = se2.compose(poses[:, None], self._back)
         return residuals(self._model, at, self.points, self._ranges, self._bearings)
 
     def _linearized(self, poses: Array) -> tuple[Array, Array]:
-        """Return residuals (N, K, 2), whitened by the sensor noise, for N present ``poses`` (N, 3). Also return their
-        Jacobians (N, K, 2, 3) by the body-frame perturbation of the present pose."""
+        """Return residuals (N, K, 2), whitened by the sensor noise, for N ``poses`` (N, 3) at the last sighting. Also
+        return their Jacobians (N, K, 2, 3) by the body-frame perturbation of the pose."""
         at, count = se2.compose(poses[:, None], self._back), len(poses)
         sightings = np.tile(self.points, (count, 1)), np.tile(self._ranges, count), np.tile(self._bearings, count)
         error, jacobian = linearize_each(self._model.packed, at.reshape(-1, 3), *sightings)
@@ -224,8 +228,8 @@ class SightingWindow:
         return error.reshape(*at.shape[:2], 2), jacobian
 
     def _normal_equations(self, poses: Array, whitener: Array, noise: Array | None) -> tuple[Array, Array]:
-        """Return the Gauss-Newton Hessian (N, 3, 3) and the gradient (N, 3) of :meth:`losses` for N present poses. The
-        Hessian includes a nearly flat prior."""
+        """Return the Gauss-Newton Hessian (N, 3, 3), with a nearly flat prior, and the gradient (N, 3) of
+        :meth:`losses`."""
         error, jacobian = self._linearized(poses)
         error, jacobian = (whitener @ error[..., None])[..., 0], whitener @ jacobian
         weight = geman_mcclure_weight(np.sum(error**2, axis=-1), self._model.robust)

@@ -1,4 +1,4 @@
-"""Loop closures found by another program: places that the robot visits again. Some may be false."""
+"""Loop closures that another program has detected: the robot is near an earlier pose again. Some may be false."""
 
 from factorgraph_loc.model.sections import Section
 from factorgraph_loc.sensors.registry import Channel, SensorType
