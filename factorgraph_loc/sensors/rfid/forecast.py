@@ -31,12 +31,13 @@ MOST_LOOKS = 1 << 16  # maximum number of rounds on a path
 
 
 class ScanTables(NamedTuple):
-    """Probabilities that A antennas read a tag, in C cells of its pose in the robot frame, and the T tags of the map.
+    """Probabilities that A antennas read a tag, tabulated by the pose of the tag in the robot frame, and a map of T
+    tags.
 
-    The cells are H heights x F facings x S x S positions. The last facing is for tags with an unknown facing. ``read``
-    (C, A): the probability q of a read. ``gain`` (A, C): log(q / (1 - q)). ``missed`` (C,): the sum of log(1 - q) over
-    antennas, minus that sum for a tag out of range. ``silent`` (C,): the sum of log(1 - q), 0 if out of range.
-    ``size``: S. ``layers``: F. ``cell``: the size of a cell [m]. ``points`` (T, 2) [m]: positions of the tags.
+    The pose has C cells: H heights x F facings x S x S positions. The last facing is for tags with an unknown facing.
+    ``read`` (C, A): the probability q of a read. ``gain`` (A, C): log(q / (1 - q)). ``missed`` (C,): the sum of
+    log(1 - q) over antennas, minus that sum for a tag out of range. ``silent`` (C,): the sum of log(1 - q), 0 if out of
+    range. ``size``: S. ``layers``: F. ``cell``: the size of a cell [m]. ``points`` (T, 2) [m]: positions of the tags.
     ``facing`` (T,) [rad]: their facings, NaN if unknown. ``first`` (T,): the first cell of the height of each tag.
     """
 
@@ -77,8 +78,8 @@ def _uniform(seed: np.uint64, number: int) -> float:
 
 @compiled(error_model="numpy", fastmath=FAST)
 def _cells(tables: ScanTables, t: int, poses: Array, turns: Array32, out: NDArray[np.int32]) -> None:
-    """Compute the cell of tag ``t`` at each robot pose in ``poses`` (M, 3), and write it to ``out`` (M,). ``turns``
-    (2, M): cosines and sines of the headings."""
+    """Write the cell of tag ``t`` at each robot pose in ``poses`` (M, 3) to ``out`` (M,). ``turns`` (2, M): cosines and
+    sines of the robot's headings."""
     size = np.int32(tables.size)
     ends, middle = np.int32(size - 1), np.float32(size // 2 + 0.5)
     first = np.int32(tables.first[t] + (tables.layers - 1) * size * size)
@@ -110,12 +111,11 @@ def log_weights(
     tempering: float,
     out: Array32,
 ) -> None:
-    """Simulate the reads of each of the first J = ``scans`` particles, and compute how likely they are for all M
-    particles.
+    """Simulate the reads of the first J = ``scans`` of M particles on a path. Compute their log-likelihood for all M.
 
-    ``out`` (J, M): receives the log-likelihood of particle m for the reads of particle j. ``poses`` (S, M, 3): the
-    poses of the particles at S stations of a path. ``rounds`` (S,): the number of rounds at each station. ``stops``
-    (M,): the number of stations that each particle reaches. ``tempering``: exponent of the likelihood.
+    ``out`` (J, M): receives the log-likelihood of particle m for the reads of particle j. ``poses`` (S, M, 3): the pose
+    of each particle at S points of the path. ``rounds`` (S,): the number of rounds at each point. ``stops`` (M,): the
+    number of points that each particle reaches. ``tempering``: exponent of the likelihood.
     """
     steps, count, _ = poses.shape
     tags = len(tables.points)
@@ -193,7 +193,8 @@ def _binomial(count: int, q: float, uniform: float) -> tuple[int, float]:
 @dataclass(frozen=True, eq=False)
 class RfidForecast:
     """Predicts the information of RFID reads on candidate paths. It implements
-    :class:`~factorgraph_loc.sensors.interfaces.Forecast`. ``rounds_per_metre``: rounds of each antenna per metre."""
+    :class:`~factorgraph_loc.sensors.interfaces.Forecast`. ``rounds_per_metre``: inventory rounds of each antenna per
+    metre."""
 
     likelihood: RfidLikelihood
     rounds_per_metre: float = 4.0
@@ -208,8 +209,8 @@ class RfidForecast:
         return make_tables(self.likelihood)
 
     def information(self, poses: Array, ways: Array) -> Array:
-        """Return the expected Fisher information (N, 3, 3) of reads on ``poses`` (N, 3). ``ways`` (N,): the length [m]
-        of the path segment of each pose, to which the number of rounds is proportional."""
+        """Return the expected Fisher information (N, 3, 3) of reads on each of the ``poses`` (N, 3) of a path. ``ways``
+        (N,): the length [m] of the path segment of each pose. The number of rounds is proportional to it."""
         count = len(self.likelihood.model.antennas)
         hits = np.zeros((count, len(self.likelihood.tags.points)), dtype=np.int64)
         one_round = TagReadCounts(np.zeros((count, 3)), np.arange(count), np.ones(count, dtype=np.int64), hits)
@@ -217,7 +218,7 @@ class RfidForecast:
         return np.asarray((self.rounds_per_metre * ways)[:, None, None] * score)
 
     def add_log_weights(self, poses: Array, metres: float, stops: Places, seed: np.uint64, out: Array32) -> None:
-        """Simulate reads from particles, and add their log-likelihoods to ``out``. See
+        """Simulate reads from particles, and add their log-likelihoods to ``out``. For the arguments see
         :meth:`~factorgraph_loc.sensors.interfaces.Forecast.add_log_weights`."""
         steps, total = len(poses), round(metres * self.rounds_per_metre)
         rounds = np.diff(np.arange(steps + 1) * total // steps).astype(np.int64)
@@ -228,8 +229,8 @@ class RfidForecast:
 
 
 def forecast(world: World, rig: Rig, speed: float, settings: Any) -> RfidForecast | None:
-    """Return the forecast for a robot that drives at ``speed`` [m/s], or None without antennas or tags. ``settings``:
-    settings of the simulation, which include the number of rounds per second."""
+    """Return the forecast of RFID reads for a robot that drives at ``speed`` [m/s], or None without antennas or tags.
+    ``settings``: settings of the simulation, which include the number of rounds per second."""
     if rig.find(RfidSettings) is None or not world.tags:
         return None
     likelihood = RfidLikelihood(rig.of(RfidSettings).model(), tag_map(world, rig.of(SurveySettings)).tags)

@@ -84,8 +84,8 @@ def check(use: Use) -> Use:
 
 
 def draw(log: Log) -> Marks:
-    """Return the marks of the tags of the map for plots and viewers, with the times of reads. If the tags are on the
-    robot, return the marks of the antennas in the building."""
+    """Return the tags of the map and the times of their reads in ``log``, for plots and viewers. If the tags are on the
+    robot, return the antennas in the building instead."""
     stream, fixed = log.streams.get("rfid"), is_fixed(log.rig)
     t, names = np.empty(0), tuple[str, ...]()
     if isinstance(stream, RfidStream):

@@ -39,7 +39,7 @@ EXACT = 0.2  # a survey is treated as exact if its standard deviation is below t
 
 
 def trust(sigmas: Array) -> float:
-    """Return an exponent, at most 1, by which the likelihood of reads accounts for survey errors of the tags.
+    """Return an exponent for the likelihood of reads, at most 1, that accounts for survey errors of the tags.
 
     ``sigmas`` (T,): standard deviations [m] of the surveyed positions. All reads of a tag share its survey error. The
     variance after driving past a tag is therefore its survey variance plus the square of :data:`PASS_SIGMA`.
@@ -94,7 +94,7 @@ def whole_scans(log: Log) -> list[RfidScan]:
 
 @dataclass(frozen=True, eq=False)
 class TagEvidence:
-    """Evidence from a scan for the state of each of U tags, which may be as surveyed, weak, moved or dead.
+    """The likelihood of a scan for the state of each of U tags, which may be as surveyed, weak, moved or dead.
 
     ``tags`` (U,): indices of the tags in the map. ``log_likelihoods`` (U, S): the log-likelihood of the reads and
     misses of each tag if it is in each of S states, see :meth:`~factors.rfid.tag_states.TagStates.expect`. ``is_read``
@@ -107,7 +107,7 @@ class TagEvidence:
 
 
 class KnownTags:
-    """Converts scans to counts of reads of the tags in the map, and estimates if tags are dead, weak or moved.
+    """Converts scans to counts of reads of the tags in the map, and estimates which tags are dead, weak or moved.
 
     ``setup``: the result of :func:`~factorgraph_loc.sensors.rfid.installation.installed`. ``diagnostics``: counts reads
     that are ignored because the tag or antenna is unknown, and lists tags that are probably dead, weak or moved.
@@ -141,20 +141,22 @@ class KnownTags:
         return np.array([(a.x, a.y) for a in model.antennas]) if model.fixed else self.map.tags.points[:, :2]
 
     def exclude(self, antenna: int) -> str:
-        """Ignore the rounds of the antenna with this index until it reads a tag. Returns the name of the antenna."""
+        """Ignore the rounds of the antenna with the index ``antenna`` until it reads a tag. Returns the antenna's
+        name."""
         self._excluded.add(antenna)
         self._rounds = {}
         return self.antennas[antenna]
 
     def temper(self, tempering: float) -> None:
-        """Set the exponent of the likelihood to the smaller of ``tempering`` and the rig's setting ``tempering``."""
+        """Set the exponent of the likelihood to ``tempering`` or the rig's value, whichever is smaller, times
+        ``trust``."""
         new = min(self._tempering, tempering) * self.trust
         if new != self.likelihood.model.tempering:
             self.likelihood = self.likelihood.tempered(new)
 
     def read_counts(self, m: RfidScan, twist: Array = STANDING, *, count: bool = True) -> TagReadCounts | None:
-        """Return the reads and misses of a scan, as a function of the pose at the time of the scan. Returns None if the
-        map has no tags, or if the rig has none of the antennas.
+        """Return the reads and misses of the scan ``m``, as a function of the pose at the time of the scan. Returns
+        None if the map has no tags, or if the rig has none of the antennas.
 
         ``twist`` (3,): the velocity of the robot. ``count``: False if the same scan will be processed again, so that
         the diagnostics must not count its ignored reads.
@@ -198,23 +200,23 @@ class KnownTags:
         return TagReadCounts(np.zeros((len(used), 3)), used, rounds, hits, odds, elsewhere, tags, prior, twists)
 
     def weigh_states(self, counts: TagReadCounts, pose: Array, covariance: Array, parameters: Array) -> TagEvidence:
-        """Return the evidence from the reads and misses ``counts`` for the states of the tags in range.
+        """Return the likelihood of the reads and misses ``counts`` for each state of the tags in range.
 
         ``pose`` (3,) with body-frame ``covariance`` (3, 3): the estimated pose before the scan corrects it.
-        ``parameters`` (Q,): the estimated parameters of the likelihood.
+        ``parameters`` (Q,): the estimated parameters of the read likelihood.
         """
         poses = sigma_poses(pose, np.ascontiguousarray(covariance), WIDENED * math.sqrt(3.0))
         places = self.states.hypotheses, FARTHEST, parameters, self.states.odds
         return TagEvidence(*self.likelihood.displaced(poses, counts, *places))
 
     def with_states(self, counts: TagReadCounts, evidence: TagEvidence) -> TagReadCounts:
-        """Return a copy of ``counts`` with the present probabilities that tags are dead, weak or moved. ``evidence``:
+        """Return a copy of ``counts`` with the current probabilities that tags are dead, weak or moved. ``evidence``:
         the result of :meth:`weigh_states` for the same scan."""
         elsewhere = self.states.expect(evidence.tags, evidence.log_likelihoods)
         return counts.with_states(evidence.tags, self.states.odds[evidence.tags], elsewhere)
 
     def without_doubtful(self, reads: TagReadCounts) -> TagReadCounts:
-        """Return a copy of ``reads`` in which tags that are clearly dead, weak or moved have no effect."""
+        """Return a copy of ``reads`` without the effect of tags that are clearly dead, weak or moved."""
         clear = self.states.odds[reads.tags] > CLEAR
         if not clear.any():
             return reads
@@ -223,8 +225,8 @@ class KnownTags:
         )
 
     def learn(self, t: float, evidence: TagEvidence) -> None:
-        """Update the states of tags with the evidence from a scan at ``t`` [s]. Evidence from reads is only used after
-        :data:`CONFIRMED` seconds."""
+        """Update the states of tags with ``evidence`` from a scan at ``t`` [s], the result of :meth:`weigh_states`. The
+        evidence of tags that were read is only used after :data:`CONFIRMED` seconds."""
         is_read, tags, log_likelihoods = evidence.is_read, evidence.tags, evidence.log_likelihoods
         self.states.learn(t, tags[~is_read], log_likelihoods[~is_read])
         self._waiting.append((t, tags[is_read], log_likelihoods[is_read]))
@@ -233,13 +235,13 @@ class KnownTags:
         self._report_suspects()
 
     def forget(self, since: float) -> None:
-        """Undo all updates of the states of tags since the time ``since`` [s]."""
+        """Undo all updates of the states of tags that used scans at or after the time ``since`` [s]."""
         self.states.forget(since)
         self._waiting = deque(row for row in self._waiting if row[0] < since)
         self._report_suspects()
 
     def silent(self) -> None:
-        """Undo all updates of the states of tags since the last read, because the reader or all tags have failed."""
+        """Undo all updates of the states of tags after the last read. Call this if the reader has failed."""
         self.forget(math.nextafter(self.states.last_read, math.inf))
 
     def _report_suspects(self) -> None:
@@ -250,7 +252,7 @@ class KnownTags:
 
     def _rows_of_antennas(self, names: tuple[str, ...]) -> tuple[list[int], Integers, Integers]:
         """Return the row of each antenna in ``names`` in a table of counts, or -1 for unknown and dead antennas. Also
-        return the antenna index and the number of rounds of each row of the table. The last result is cached."""
+        return the antenna index and the number of rounds of each row of the table."""
         if names not in self._rounds:
             antennas = [self._antennas.get(name, -1) for name in names]
             antennas = [-1 if antenna in self._excluded else antenna for antenna in antennas]
@@ -296,8 +298,8 @@ class TagSignals:
             self._window, self._step = settings.phase.window, settings.phase.step
 
     def strengths(self, m: RfidScan) -> RssiReads | None:
-        """Return the signal strengths of the reads in a scan, as a function of the pose at the time of the scan.
-        Returns None without signal strengths."""
+        """Return the signal strengths of the reads in the scan ``m``, as a function of the pose at the time of the
+        scan. Returns None if the run does not use them or the scan has none."""
         if self.strength is None:
             return None
         antennas, tags = self._tags.places(m)
@@ -307,7 +309,7 @@ class TagSignals:
         return RssiReads(np.zeros((len(rows), 3)), antennas[rows], tags[rows], m.rssi[rows])
 
     def keep(self, m: RfidScan) -> bool:
-        """Store the phases of the reads in a scan. Returns True if a window ends with this scan."""
+        """Store the phases of the reads in the scan ``m``. Returns True if a time window ends with this scan."""
         if self.phase is None:
             return False
         antennas, tags = self._tags.places(m)
@@ -324,13 +326,13 @@ class TagSignals:
         return True
 
     def times(self) -> Array:
-        """Return the times (R,) [s] of the reads in the current window."""
+        """Return the times (R,) [s] of the reads in the current time window of phases."""
         return np.array([row[0] for row in self._of_window()])
 
     def phases(self, offsets: Array, pose: Array) -> RfidFactor | None:
-        """Return the phases in the current window as a factor on the robot's pose, or None if too few of the reads are
-        near their tags. ``pose`` (3,): the predicted pose. ``offsets`` (R, 3): poses at the reads, relative to
-        ``pose``."""
+        """Return the phases of the R reads in the current time window as a factor on the robot's pose. Returns None if
+        too few reads are near their tags. ``pose`` (3,): the predicted pose. ``offsets`` (R, 3): the robot's poses at
+        the reads, in the frame of ``pose``."""
         if self.phase is None:
             return None
         _, antennas, tags, phase, frequency = (np.array(column) for column in zip(*self._of_window(), strict=True))
@@ -339,7 +341,7 @@ class TagSignals:
         return RfidFactor(self.phase, reads) if len(reads.phase) else None
 
     def forget(self, since: float) -> None:
-        """Delete all reads in scans since the time ``since`` [s], because these scans will be processed again."""
+        """Delete all reads in scans at or after ``since`` [s]. Call this before these scans are processed again."""
         while self._rows and self._rows[-1][0] >= since:
             self._rows.pop()
         while self._ended and self._ended[-1] >= since:

@@ -40,16 +40,17 @@ class SilenceMonitor:
 
     def add(self, reads: int, evidence: float) -> bool:
         """Add a scan. Returns True if the reader or all tags have failed. ``reads``: the number of reads in the scan.
-        ``evidence``: the log-probability of the scan at the predicted pose."""
+        ``evidence``: the log-probability of the scan at the predicted pose. It is summed since the last read."""
         self._evidence = 0.0 if reads else self._evidence + evidence
         self.lasts = self._evidence < -SILENT
         return self.lasts
 
 
 class ScanMonitor:
-    """Detects that scans are much less likely than expected if the estimated pose is right.
+    """Detects that scans are much less likely at the estimated pose than they should be on average.
 
-    Dead tags or a wrong map may also be the reason. Global localization must then decide if another pose is better.
+    The reason may be a wrong pose, dead tags or a wrong map. Global localization must then decide if another pose is
+    better. ``suspicious_since``: the time [s] since which the scans are too unlikely, or None.
     """
 
     def __init__(self) -> None:
@@ -58,7 +59,7 @@ class ScanMonitor:
         self._usual = 0.0  # the mean ``surprise`` per scan that is expected
 
     def add(self, t: float, surprise: float, variance: float) -> None:
-        """Add a scan at ``t`` [s], and update ``suspicious_since``. Later scans are discarded.
+        """Add a scan at ``t`` [s], and update ``suspicious_since``. Stored scans at or after ``t`` are discarded.
 
         ``surprise``: the negative log-likelihood of the scan at the predicted pose, minus the expected value.
         ``variance``: the variance of ``surprise``.
@@ -76,14 +77,14 @@ class ScanMonitor:
             self.suspicious_since = None
 
     def accept(self) -> None:
-        """Reset ``suspicious_since``, because the pose is right and the model or the map is wrong. Later scans are
-        expected to be as unlikely as the last ones."""
+        """Reset ``suspicious_since``. Call this if the pose is right and the model or the map is wrong. Later scans are
+        then expected to be as unlikely as the last ones."""
         excess, _, count = self._sums()
         self._usual = excess / max(count, 1)
         self.suspicious_since = None
 
     def clear(self) -> None:
-        """Discard all scans, because the estimated pose was replaced."""
+        """Discard all scans. Call this if the estimated pose was replaced."""
         self._scans.clear()
         self.suspicious_since = None
 
@@ -111,7 +112,7 @@ class ScanMonitor:
 class BurstMonitor:
     """Estimates how strongly successive reads of a tag are correlated, for example because a person is in the way.
 
-    The measure is the overdispersion: the variance of the number of reads in a time block, divided by the variance for
+    The measure is the overdispersion: the variance of the number of reads in a time block, divided by its value for
     independent reads (McCullagh and Nelder, "Generalized linear models", 1989, section 4.5). If it is n, n correlated
     rounds have as much information as one independent round. ``antennas``, ``tags``: numbers of antennas and tags.
     """
@@ -126,13 +127,14 @@ class BurstMonitor:
 
     @property
     def overdispersion(self) -> float:
-        """The estimated overdispersion. Small values are replaced by 1, because they occur by chance."""
+        """The estimated overdispersion, 1 for independent reads. Small values become 1, because they occur by
+        chance."""
         ratio = float(self._sums[0] / self._sums[1])
         return ratio if ratio > INDEPENDENT else 1.0
 
     def add(self, t: float, measured: TagReadCounts, reads: ExpectedReads, counts: NDArray[np.bool_]) -> None:
         """Add a scan at ``t`` [s]. Scans that are not later than all previous scans are ignored. ``measured``: the
-        scan. ``reads``: observed and expected reads of C tags. ``counts`` (C,): True for tags that are counted."""
+        scan. ``reads``: observed and expected reads of C tags. ``counts`` (C,): a mask of the tags to use."""
         if t <= self._last:
             return
         self._last = t
@@ -144,7 +146,7 @@ class BurstMonitor:
         self._tags = np.union1d(self._tags, reads.tags)
 
     def clear(self) -> None:
-        """Discard the current block, because the estimated pose was wrong."""
+        """Discard the scans of the current time block. Call this if the estimated pose was wrong."""
         _taken(self._cells, self._tags)
         self._tags, self._begun = NO_TAGS, -math.inf
 
@@ -161,7 +163,7 @@ def _count(
 ) -> None:
     """Add the reads of C ``tags`` by K ``antennas`` to the ``cells`` of :class:`BurstMonitor`. ``rounds`` (K,): numbers
     of rounds. ``hits`` (K, C): numbers of reads. ``p`` (K, C): the probability of a read in one round. ``counts`` (C,):
-    True for tags that are counted."""
+    a mask of the tags to use."""
     for c in range(len(tags)):
         for k in range(len(antennas)):
             if counts[c] and p[k, c] > POSSIBLE:
@@ -171,7 +173,8 @@ def _count(
 
 @compiled
 def _taken(cells: Array, tags: Integers) -> tuple[float, float]:
-    """Return the sum of squared differences and the sum of variances in the cells of ``tags``, and clear the cells."""
+    """Return the sum of squared differences of observed and expected reads, and the sum of their variances, over the
+    cells of ``tags``. Also clear these ``cells`` of :class:`BurstMonitor`."""
     squares = variances = 0.0
     for t in tags:
         for a in range(cells.shape[2]):
@@ -195,8 +198,8 @@ KNOWN = BAND / 4.0  # m; maximum standard deviation of the position for a scan t
 
 @dataclass(frozen=True, eq=False)
 class ReadGroups:
-    """Counts of reads in G groups: one group for each band of the distance between antenna and tag, then one for each
-    of the ``antennas``.
+    """Sums of observed and predicted reads in G groups: one for each interval of the distance between antenna and tag,
+    then one for each of the ``antennas``.
 
     ``sums`` (3, G): the number of observed reads, the number of predicted reads, and the variance of the number of
     observed reads if all rounds were independent.
@@ -209,24 +212,24 @@ class ReadGroups:
         object.__setattr__(self, "sums", np.zeros((3, BANDS + len(self.antennas))))
 
     def add(self, antennas: Integers, rounds: Integers, reads: ExpectedReads, counts: NDArray[np.bool_]) -> None:
-        """Add the observed and predicted ``reads`` of C tags by K ``antennas``. ``rounds`` (K,): numbers of rounds.
-        ``counts`` (K, C): True for reads that are counted."""
+        """Add the observed and predicted ``reads`` of C tags by K ``antennas`` to ``sums``. ``rounds`` (K,): the number
+        of rounds of each antenna. ``counts`` (K, C): a mask of the reads to use."""
         _add(self.sums, antennas, rounds, reads.hits, reads.p, reads.distance, counts)
 
     def large(self, fewest: float = FEWEST) -> Integers:
-        """Return the indices of the groups with at least ``fewest`` predicted reads. If there is only one antenna, its
-        group is omitted."""
+        """Return the column indices in ``sums`` of the groups with at least ``fewest`` predicted reads. If there is
+        only one antenna, the group of this antenna is omitted."""
         count = len(self.sums[1]) if len(self.antennas) > 1 else BANDS
         return np.flatnonzero(self.sums[1, :count] >= fewest)
 
     def names(self, groups: Integers) -> list[str]:
-        """Return the names of the groups with the indices ``groups``."""
+        """Return a name for each of ``groups`` (column indices in ``sums``), such as "0 to 1 m" or "antenna left"."""
         bands = [f"{b * BAND:g} to {(b + 1) * BAND:g} m" for b in range(BANDS)]
         return [(bands + [f"antenna {name}" for name in self.antennas])[g] for g in groups.tolist()]
 
     def shares(self, groups: Integers) -> str:
-        """Return a text with the ratio of observed to predicted reads of each of ``groups`` (indices). Only the
-        :data:`SHOWN` groups with the largest errors are named, worst first."""
+        """Return a text with the ratio of observed to predicted reads, such as "antenna left: 0.42". It names up to
+        :data:`SHOWN` of the ``groups`` (column indices in ``sums``), those with the largest errors, worst first."""
         observed, predicted, variance = self.sums[:, groups]
         worst = np.argsort(-np.abs(observed - predicted) / np.sqrt(variance), kind="stable")[:SHOWN]
         names = self.names(groups[worst])
@@ -236,9 +239,8 @@ class ReadGroups:
 class ConsistencyMonitor:
     """Tests if recent reads agree with the detection models. ``doubted``: True while they disagree.
 
-    Two chi-square tests compare observed and predicted reads: one by distance bands, the other by antennas. Groups with
-    few predicted reads are merged. The models are rejected if a test fails and the relative errors exceed
-    :data:`DIFFERENT`.
+    Two chi-square tests compare observed and predicted reads: one by distance intervals, the other by antennas. Groups
+    with few predicted reads are merged. The models are rejected if a test fails and relative errors exceed DIFFERENT.
     """
 
     def __init__(self, antennas: Sequence[str]) -> None:
@@ -250,8 +252,9 @@ class ConsistencyMonitor:
         self, t: float, measured: TagReadCounts, reads: ExpectedReads, counts: NDArray[np.bool_], overdispersion: float
     ) -> None:
         """Add a scan at ``t`` [s], and update ``doubted``. Scans that are not later than all previous scans are
-        ignored. ``measured``: the scan. ``reads``: observed and expected reads. ``counts`` (K, C): True for reads that
-        are counted. ``overdispersion``: the number of correlated rounds that count as one."""
+        ignored. ``measured``: the scan. ``reads``: observed and expected reads of C tags by K antennas. ``counts``
+        (K, C): a mask of the reads to use. ``overdispersion``: n correlated rounds have the information of n /
+        ``overdispersion`` rounds."""
         if t <= self._last:
             return
         forgotten = math.exp((self._last - t) / WINDOW)
@@ -264,8 +267,8 @@ class ConsistencyMonitor:
         self.doubted = chance < (TRUSTED if self.doubted else DOUBTED)
 
     def _chance(self, groups: slice, overdispersion: float) -> float:
-        """Return the p-value of the reads in ``groups`` for a correct model, or 1 if the relative error is at most
-        DIFFERENT. ``overdispersion``: the number of correlated rounds that count as one."""
+        """Return the p-value of the observed reads in ``groups`` if the model is correct, or 1 if the relative error is
+        at most DIFFERENT. ``overdispersion``: the number of correlated rounds that count as one."""
         observed, predicted, variance = _merged(self._groups.sums[:, groups], FEWEST)
         off = observed - predicted
         if np.sum(np.abs(off)) <= DIFFERENT * np.sum(predicted):
@@ -276,7 +279,8 @@ class ConsistencyMonitor:
 
     @property
     def shares(self) -> str:
-        """A text with the ratio of observed to predicted reads of the groups with the largest errors."""
+        """A text with the ratio of observed to predicted reads of the antennas and distances with the largest
+        errors."""
         groups = self._groups.large()
         return self._groups.shares(groups if len(groups) else self._groups.large(1.0))
 
@@ -287,7 +291,7 @@ class ConsistencyMonitor:
         return np.flatnonzero((predicted > MANY * overdispersion) & (observed < NEARLY_NONE * predicted)).tolist()
 
     def clear(self) -> None:
-        """Discard all counts, because the estimated pose was wrong or the model has changed."""
+        """Discard all stored reads. Call this if the estimated pose was wrong or the model has changed."""
         self._groups.sums[:] = 0.0
         self.doubted = False
 
@@ -304,7 +308,7 @@ def _add(
 ) -> None:
     """Add reads of C tags by K ``antennas`` to the ``sums`` of :class:`ReadGroups`. ``rounds`` (K,): numbers of rounds.
     ``hits`` (K, C): numbers of reads. ``p`` (K, C): probability of a read in one round. ``distance`` (K, C): distance
-    [m]. ``counts`` (K, C): True for reads that are counted."""
+    of antenna and tag [m]. ``counts`` (K, C): a mask of the reads to use."""
     for k in range(len(antennas)):
         for c in range(p.shape[1]):
             if counts[k, c]:
@@ -317,9 +321,9 @@ def _add(
 
 @compiled
 def _merged(sums: Array, least: float) -> Array:
-    """Merge neighbouring groups until each has at least ``least`` predicted reads, from the last group to the first.
+    """Return sums (3, H) after merging neighbouring groups until each has at least ``least`` predicted reads.
 
-    ``sums`` (3, G): see :class:`ReadGroups`. Returns the sums (3, H) of the H merged groups. H is 0 if all groups
+    ``sums`` (3, G): see :class:`ReadGroups`. Groups are merged from the last to the first. H is 0 if all groups
     together have too few predicted reads.
     """
     out, count, open_ = np.zeros(sums.shape), 0, 0.0

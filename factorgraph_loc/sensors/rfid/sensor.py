@@ -46,7 +46,9 @@ class TagObservation:
     """An observation of RFID reads: of reads and misses, of signal strengths, or of phases.
 
     ``factor``: the likelihood, which depends on the pose and on estimated parameters of the detection models.
-    ``found``: number of reads. ``blocks``: the name of the state block with these parameters, or ().
+    ``found``: number of reads. ``here``: the reads and misses relative to the pose at the scan, None for strength and
+    phase. ``rounds``: number of inventory rounds. ``blocks``: the name of the state block with the estimated
+    parameters, or (). ``states``: likelihood of the scan if tags are dead, weak or moved, or None.
     """
 
     t: float
@@ -74,8 +76,8 @@ class TagObservation:
         return frozenset(reads.read_tags.tolist()) if isinstance(reads, TagReadCounts) else frozenset()
 
     def at_its_time(self) -> Self | None:
-        """Return an observation that depends only on the pose at the time ``t``, with the detection models of the rig
-        instead of estimated models. Returns None for strength and phase."""
+        """Return an observation that depends on the pose at its time ``t`` alone, or None for signal strengths and
+        phases. It has the detection models of the rig instead of estimated models."""
         likelihood = self.factor.likelihood
         if self.here is None or not isinstance(likelihood, RfidLikelihood):
             return None
@@ -110,19 +112,19 @@ class TagObservation:
         return self.factor.log_likelihood(poses, *(values[name] for name in self.blocks))
 
     def on_pose(self, values: Mapping[str, Array], spreads: Mapping[str, Array]) -> Self:
-        """Return an observation that depends on the pose only, with the parameters of the detection models fixed at
-        ``values``. ``spreads`` is ignored."""
+        """Return an observation that depends on the pose only. ``values``: the estimated parameters of the detection
+        models by block, treated as exact. ``spreads`` is ignored."""
         if not self.blocks:
             return self
         return replace(self, factor=self.factor.fixed(values[self.blocks[0]]), blocks=())
 
 
 class TagSensor(Sensor):
-    """The RFID reader in a run.
+    """A sensor that uses the scans of an RFID reader.
 
-    Each scan yields an observation of reads and misses, and an observation of signal strengths. Windows of phases yield
-    further observations. Scans are rejected while the reader has failed (:class:`.SilenceMonitor`). Global localization
-    only uses reads and misses, because the likelihoods of strength and phase are multimodal.
+    Each scan yields an observation of reads and misses, and an observation of signal strengths. Time windows of phases
+    yield further observations. Scans are rejected while the reader has failed (:class:`.SilenceMonitor`). Global
+    localization uses reads and misses only, because the likelihoods of strength and phase are multimodal.
     """
 
     modality = "rfid"
@@ -176,7 +178,7 @@ class TagSensor(Sensor):
                     yield TagObservation(m.t, window, 1)
 
     def _learns(self, t: float) -> bool:
-        """Return True if detection models and states of tags may be estimated at ``t`` [s]. They must not if the pose
+        """Return True if detection models and states of tags may be estimated at ``t`` [s]. Returns False if the pose
         is new or suspicious, or if the wheels slip."""
         return not self._wheels.is_slipping and self.suspicious_since is None and t >= self._confirmed
 
@@ -224,20 +226,20 @@ class TagSensor(Sensor):
                 self._diagnostics.event(t, "doubted_model", DOUBTED_MODEL, shares=self._consistency.shares)
 
     def _values(self, view: View) -> dict[str, Array]:
-        """Return the estimated parameters (P,) of the detection models by the name of their state block, or {} if no
-        parameters are estimated."""
+        """Return the estimated parameters (P,) of the detection models, by the name of their state block. {} if there
+        are none."""
         value = view.value(self.name) if self._blocks else None
         return {} if value is None else {self.name: value}
 
     def _estimated(self, view: View) -> Array:
-        """Return all parameters (Q,) of the likelihood, with current values of the estimated parameters."""
+        """Return all parameters (Q,) of the read likelihood, with current values of the estimated parameters."""
         out = self.tags.likelihood.parameters.copy()
         for value in self._values(view).values():
             out[list(self.constants.indices)] = value
         return out
 
     def _is_evidence(self, observation: TagObservation, evidence: float) -> bool:
-        """Return False if the reader or all tags have failed at the time of this observation, otherwise True.
+        """Return False if the reader or all tags have failed at the time of ``observation``, otherwise True.
         ``evidence``: the log-probability of the scan at the predicted pose."""
         # a scan without reads counts only once, even if it is processed again after a late measurement
         if observation.found or observation.t > self._heard:
@@ -271,8 +273,8 @@ class TagSensor(Sensor):
         self._monitor.accept()
 
     def gathered(self, observations: Sequence[TagObservation]) -> list[Term]:
-        """Return the graph factors of observations that depend on one pose: one factor for all reads and misses, and
-        one for each observation of strength or phase."""
+        """Return the graph factors of ``observations`` of the same pose: one factor for all reads and misses, and one
+        for each observation of strength or phase."""
         counts: list[TagReadCounts] = []
         terms: list[Term] = []
         for observation in observations:
@@ -290,8 +292,8 @@ class TagSensor(Sensor):
         return terms
 
     def at_end(self, factor: Factor, width: float) -> Factor | None:
-        """Return a copy of ``factor`` in which tags that are clearly dead, weak or moved have no effect. Returns None
-        for phases if ``width`` is above 1, because their likelihood has local optima centimetres apart."""
+        """Return a copy of ``factor`` without the effect of tags that are clearly dead, weak or moved. Returns None for
+        phases if ``width`` is above 1, because their likelihood has local optima centimetres apart."""
         factor = cast(RfidFactor, factor)
         if width > 1.0 and isinstance(factor.likelihood, PhaseLikelihood):
             return None

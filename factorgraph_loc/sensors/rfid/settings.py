@@ -103,7 +103,7 @@ class GridSettings(FileModel):
         return inside(self._folder, self.file, "grid")
 
     def placed(self, folder: Path) -> GridSettings:
-        """Return a copy that looks for its file in ``folder``, the folder of the rig's file."""
+        """Return a copy that reads its file from ``folder``, the folder of the rig's file."""
         out = self.model_copy()
         out._folder = folder
         return out
@@ -268,7 +268,7 @@ class RfidSettings(SensorSettings):
         return self.antennas if self.preset is None else rackham(self.preset_z)
 
     def placed(self, folder: Path) -> RfidSettings:
-        """Return a copy that looks for the files of detection grids in ``folder``."""
+        """Return a copy that reads the files of detection grids from ``folder``."""
         models = {k: m.placed(folder) if isinstance(m, GridSettings) else m for k, m in self.models.items()}
         return self.model_copy(update={"models": models})
 
@@ -279,10 +279,8 @@ class RfidSettings(SensorSettings):
                 write_grid(model.model(), folder / model.file)
 
     def estimated(self, *, mounting: bool = True) -> Estimated:
-        """Return the parameters of the likelihood (:mod:`factors.rfid.parameters`) that are estimated in a run.
-
-        ``mounting``: False to exclude the yaws of antennas and the time offset.
-        """
+        """Return the names and standard deviations of the parameters of the likelihood that are estimated in a run. The
+        parameters are those of :mod:`factors.rfid.parameters`. ``mounting``: False to exclude yaws and time offset."""
         used, known, antennas = self.parameter_names(), self.uncertainties(), list(self.all_antennas())
         names = [used[model][i] if model in used else "" for model in self.models for i in range(len(OF_MODEL))]
         sigmas = [getattr(m.prior, name) * (k in used) for k, m in self.models.items() for name in OF_MODEL]
@@ -293,14 +291,14 @@ class RfidSettings(SensorSettings):
         return Estimated.among(names, np.array(sigmas))
 
     def uncertainties(self) -> dict[str, float]:
-        """Return the standard deviations in ``uncertainty`` by name, with defaults for missing values."""
+        """Return the standard deviations of ``uncertainty`` by name. Missing values are replaced by their defaults."""
         largest = max(self.models[antenna.model].prior.range_scale for antenna in self.all_antennas().values())
         given = self.uncertainty.model_dump(exclude_none=True)
         return {name: share * largest for name, share in BY_RANGE.items()} | given
 
     def parameter_names(self) -> dict[str, tuple[str, ...]]:
         """Return the names of the parameters of each detection model that an antenna uses, by the name of the model. If
-        several models are used, names have the prefix ``MODEL.``."""
+        several models are used, the names of parameters have the prefix ``MODEL.``."""
         used = {antenna.model for antenna in self.all_antennas().values()}
         prefixes = {model: "" if len(used) == 1 else f"{model}." for model in self.models if model in used}
         return {model: tuple(prefix + name for name in OF_MODEL) for model, prefix in prefixes.items()}
@@ -349,8 +347,7 @@ LARGEST = 20.0  # maximum absolute logit; the probability is then 0 or 1 to nine
 
 
 def read_grid(path: str | Path) -> GridModel:
-    """Return the detection grid in an .npz file, with clipped logits. Raises InputError if an array is missing, or if
-    its shape or values are invalid."""
+    """Return the detection grid in the .npz file ``path``. Raises InputError if an array is missing or invalid."""
     arrays = _read_arrays(Path(path))
     logits, origin, heights = arrays["logits"], arrays["origin"], np.atleast_1d(arrays["heights"])
     if logits.ndim != 4 or min(logits.shape[2:]) < 2 or min(logits.shape) < 1 or logits.shape[0] != len(heights):
@@ -384,7 +381,7 @@ def _read_arrays(path: Path) -> dict[str, Array]:
 
 
 def write_grid(grid: GridModel, path: str | Path) -> None:
-    """Write a detection grid to an .npz file, atomically."""
+    """Write a detection grid to the .npz file ``path``. If writing fails, an existing file is not changed."""
     with replacing(Path(path)) as temporary, temporary.open("wb") as file:
         np.savez_compressed(
             file,

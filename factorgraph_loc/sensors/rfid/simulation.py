@@ -111,8 +111,8 @@ Hits = NDArray[np.bool_]
 
 
 def read_probabilities(likelihood: RfidLikelihood, poses: Array) -> Array:
-    """Return the probability (N, A, T) that antenna a reads tag t in one round at the robot pose n, including false
-    reads. ``poses`` (N, 3): the robot poses."""
+    """Return the probability (N, A, T) that antenna a reads tag t in one inventory round at robot pose n, including
+    false reads. ``poses`` (N, 3): the robot poses."""
     antennas = range(len(likelihood.model.antennas))
     return np.stack([likelihood.probabilities(poses, a) for a in antennas], axis=1)
 
@@ -130,10 +130,10 @@ def draw_reads(
     dead: NDArray[np.int64],
     rng: np.random.Generator,
 ) -> Hits:
-    """Draw random reads of T tags by A antennas in rounds at ``times`` (N,). Returns a mask (N, A, T) of the reads.
+    """Return a mask (N, A, T) of random reads of T tags by A antennas in inventory rounds at ``times`` (N,) [s].
 
     ``probabilities`` (N, A, T): the mean probability of a read over time. ``faults``: the faults to simulate, except
-    those of map and clock. In a fade, tags have only false reads. Outside of fades their probability is therefore
+    those of map and clock. In a fade, tags have only false reads. Outside of fades, their probability is therefore
     higher. ``dead``: indices of tags that are never read.
     """
     shape = probabilities.shape
@@ -160,9 +160,9 @@ def rfid_stream(
 ) -> RfidStream:
     """Return simulated reads as a stream. ``hits`` (N, A, T): a mask of the reads, see :func:`draw_reads`.
 
-    ``names`` (A): antennas. ``epcs`` (T): tags. ``times`` (N,): the times [s] of the reads, at which a round of every
-    antenna ends. ``faults``: stops antennas, and shifts the clock. ``signals``: values (N, A, T) of "rssi", "phase" and
-    "frequency", if they are simulated.
+    ``names`` (A): antennas. ``epcs`` (T): tags. ``times`` (N,): the times [s] of the reads. A round of every antenna
+    ends at each time. ``faults``: stops antennas, and shifts the clock. ``signals``: values (N, A, T) of "rssi",
+    "phase" and "frequency", if they are simulated.
     """
     listened = np.ones(hits.shape[:2], dtype=bool)
     stop = faults.antenna_stop
@@ -189,7 +189,7 @@ def rfid_stream(
 
 
 def _fades(fading: Fading, times: Array, shape: tuple[int, int], rng: np.random.Generator) -> Hits:
-    """Simulate fades at ``times`` (N,). Returns a mask (N, A, T) that is True while antenna a cannot read tag t.
+    """Return a mask (N, A, T) that is True while antenna a cannot read tag t, for random fades at ``times`` (N,) [s].
 
     ``shape``: (A, T). Each pair of an antenna and a tag has a stationary Markov chain with two states (Gilbert, Bell
     System Technical Journal 39, 1960).
@@ -304,7 +304,7 @@ def looks(settings: Any) -> dict[str, float]:
 def _surveyed(
     tags: Mapping[str, Tag], faults: FaultSettings, rng: np.random.Generator
 ) -> tuple[dict[str, Tag], list[str]]:
-    """Return a copy of ``tags`` in which some have a wrong position, and the names of these tags."""
+    """Return a copy of ``tags`` with some wrong positions, and the names of these tags."""
     names = list(tags)
     chosen = sorted(rng.permutation(len(names))[: round(faults.misplaced * len(names))].tolist())
     surveyed = dict(tags)

@@ -73,10 +73,9 @@ READS = Table(
 class RfidScan:
     """Inventory rounds of A antennas that ended at the time ``t`` [s], with R tag reads.
 
-    ``antennas``: the antenna of each round. Tags that a round did not read count as missed by its antenna.
-    ``antenna`` (R,): the index in ``antennas`` of the round of each read. ``tags``: R EPCs. ``age`` (R,): time [s] from
-    the read to ``t``. ``rssi`` (R,) [dBm], ``phase`` (R,) [rad] as the reader reports it, ``frequency`` (R,) of the
-    carrier [Hz]: NaN if unknown.
+    ``antennas``: the antenna of each round. Tags that a round did not read count as missed by this antenna. ``antenna``
+    (R,): the index in ``antennas`` of the round of each read. ``tags``: R EPCs. ``age`` (R,): time [s] from the read to
+    ``t``. ``rssi`` (R,) [dBm], ``phase`` (R,) [rad] as reported, carrier ``frequency`` (R,) [Hz]: NaN if unknown.
     """
 
     sensor: ClassVar[str] = "rfid"
@@ -130,7 +129,7 @@ class RfidStream(Stream):
         return np.asarray(np.unique(self.number, return_index=True)[1])
 
     def hits(self, tags: Mapping[str, int]) -> NDArray[np.bool_]:
-        """Return a mask (R, T) that is True if round r read tag t. ``tags``: the column t of each EPC."""
+        """Return a mask (R, T) that is True if round r has read tag t. ``tags``: the column t of each tag by EPC."""
         out = np.zeros((len(self.first_rows), len(tags)), dtype=bool)
         columns = np.array([tags.get(epc, -1) for epc in self.epc], dtype=np.int64)
         out[self.number[columns >= 0], columns[columns >= 0]] = True
@@ -244,11 +243,11 @@ def check(m: RfidScan, where: str) -> dict[str, Any]:
 def along_reference(
     log: Log, tags: Mapping[str, int], antennas: Mapping[str, int]
 ) -> tuple[RfidStream, Integers, Array, Array, Integers, Integers]:
-    """Return the R reads of a log for which tag, antenna and reference pose are known.
+    """Return the R reads of a log with known tag, antenna and reference pose, as six values.
 
-    ``tags``, ``antennas``: the index of each tag by EPC, and of each antenna by name. Returns the stream, the row
-    numbers (R,) of the reads, their times (R,) [s], the robot's poses (R, 3), the antenna indices (R,), and the tag
-    indices (R,). Raises InputError if the log has no reference or no reads.
+    They are the stream, the row numbers (R,) of the reads, their times (R,) [s], the robot's poses (R, 3), antenna
+    indices (R,), and tag indices (R,). ``tags``, ``antennas``: the index of each tag by EPC, and of each antenna by
+    name. Raises InputError if the log has no reference or no reads.
     """
     if log.reference is None:
         raise InputError(f"{log.name}: has no reference trajectory, which the calibration needs")

@@ -201,7 +201,7 @@ TURNED, LATE = math.radians(3.0), 0.05  # minimum change of a yaw [rad] and of a
 
 
 def review(use: Use, ending: Ending) -> Review:
-    """Return the review of the RFID sensor after a run: warnings, and the reliability of the detection models."""
+    """Return warnings after a run, and the reliability of the RFID detection models."""
     use = replace(use, log=installed(use.log)) if "rfid" in use.sensors else use
     models = reliability(use, ending.final_diagnostics, ending.learnt, ending.final)
     return Review((*doubts(use, ending.diagnostics, ending.learnt), *models.warnings), models.reliability)
@@ -209,7 +209,8 @@ def review(use: Use, ending: Ending) -> Review:
 
 def doubts(use: Use, diagnostics: Diagnostics, learnt: Learnt) -> Iterator[Notice]:
     """Yield warnings after a run: reads that are not used, tags that are probably dead, weak or moved, and estimated
-    constants that differ from the rig. ``diagnostics``: of the causal estimates. ``learnt``: estimated constants."""
+    constants that differ from the rig. ``diagnostics``: of the causal estimates. ``learnt``: the estimated
+    constants."""
     log, rounds = use.log, diagnostics.ignored.get("rfid", 0)
     if rounds and use.estimator != "dead_reckoning":  # no warning, because dead reckoning uses only odometry
         ignored = "{log}: {estimator} does not use RFID: all {rounds} inventory rounds are ignored"
@@ -305,10 +306,11 @@ class _Trials:
 
 
 def reliability(use: Use, diagnostics: Diagnostics, learnt: Learnt, final: Trajectory) -> Review:
-    """Compare observed reads with predicted reads along the trajectory ``final``, without tags that are probably dead.
+    """Return the reliability of the detection models, and warnings, from reads along the trajectory ``final``.
 
-    Returns the reliability of the detection models, and warnings. The review is empty without reads, antennas or
-    covariances. ``diagnostics``: the diagnostics of ``final``. ``learnt``: the estimated parameters of the models.
+    Observed reads are compared with predicted reads of all tags, except tags that are probably dead. The review is
+    empty without reads, antennas or covariances. ``diagnostics``: the diagnostics of ``final``. ``learnt``: the
+    estimated parameters of the models.
     """
     log, settings = use.log, use.log.rig.find(RfidSettings)
     stream = log.streams.get("rfid")
@@ -349,9 +351,9 @@ def _observed(
 
 
 def _counted(log: str, trials: _Trials, antennas: list[str], tempering: float) -> Review:
-    """Compare observed and predicted reads in ``trials`` by bands of distance and by ``antennas``. Returns the
-    reliability and warnings, or an empty review if too few reads are predicted. ``log``: the name of the log.
-    ``tempering``: the exponent of the likelihood in the rig."""
+    """Return the reliability and warnings from observed and predicted reads by intervals of distance and by
+    ``antennas``. The review is empty if too few reads are predicted. ``log``: the name of the log. ``tempering``: the
+    exponent of the likelihood in the rig."""
     if trials.p.sum() < FEWEST:
         return Review()
     groups = ReadGroups(antennas)
@@ -383,7 +385,7 @@ def _counted(log: str, trials: _Trials, antennas: list[str], tempering: float) -
 
 def _overdispersion(trials: _Trials, band: Integers) -> float:
     """Return the overdispersion (:func:`.overdispersion`) of ``trials``. The probabilities are scaled first, so that
-    they predict the number of reads in each distance band. ``band`` (M,): the distance band of each trial."""
+    they predict the number of reads in each distance interval. ``band`` (M,): the interval of each trial."""
     share = np.ones(int(band.max(initial=0)) + 1)
     predicted, observed = np.bincount(band, trials.p), np.bincount(band, trials.hit)
     np.divide(observed, predicted, out=share, where=predicted > 0.0)

@@ -123,10 +123,10 @@ def assemble(rows: Mapping[str, TableRows], reading: Reading) -> RfidStream:
 def read_rounds(
     reads: TableRows | None, inventories: TableRows | None, gap: float, warnings: list[Notice]
 ) -> ReadsByRound:
-    """Return the reads of a log, assigned to rounds. Without ``inventories``, a ``gap`` [s] between reads ends a round.
+    """Return the reads of a log, assigned to inventory rounds. Without ``inventories``, a ``gap`` [s] ends a round.
 
-    Reads in none of the ``inventories`` are skipped, with a warning. Raises InputError with file, row and field for an
-    invalid value.
+    Reads in none of the ``inventories`` are skipped, and a warning is appended to ``warnings``. Raises InputError with
+    file, row and field for an invalid value.
     """
     if inventories is not None:
         return _from_inventories(reads, inventories, warnings)

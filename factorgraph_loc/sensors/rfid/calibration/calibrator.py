@@ -36,8 +36,9 @@ class RfidCalibrator(Calibrator):
     def learn(
         self, traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path | None, like: SensorKnowledge | None = None
     ) -> SensorKnowledge:
-        """Estimate survey transform, mounting and models. See :meth:`Calibrator.learn`. With smoothed trajectories, the
-        survey transform is not estimated. Raises InputError if the rig has no antennas, or if a log is too short."""
+        """Return the survey transform, the mounting and the detection models. See :meth:`Calibrator.learn`. With
+        smoothed trajectories, the survey transform is not estimated. Raises InputError without antennas or for too
+        short logs."""
         logs = [replace(trace.log, rig=rig) for trace in traced]
         if self.channel not in logs[0].streams or self.channel not in rig.sensors:
             return SensorKnowledge()
@@ -66,7 +67,7 @@ class RfidCalibrator(Calibrator):
         return rig.model_copy(update={"rfid": rig.rfid.model_copy(update={"models": models})})
 
     def is_complete(self, rig: Rig) -> bool:
-        """True unless ``rig`` uses the reader but lacks its section or has only the default detection model."""
+        """Return False if ``rig`` uses the reader, but lacks its section or has only the default detection model."""
         return super().is_complete(rig) and (rig.rfid is None or rig.rfid.models != default_models())
 
     def pictures(self, knowledge: SensorKnowledge) -> Sequence[Part]:
@@ -81,8 +82,9 @@ CALIBRATOR = RfidCalibrator()
 
 
 def field_figure(fit: RfidFit) -> Picture:
-    """Return a plot of the read probability around the antenna, with a row for each detection model: observed on the
-    left, by the model on the right. A model with facing has three plots: tag facing towards, across and away."""
+    """Return a plot of the read probability around the antenna, with one row of panels for each detection model of
+    ``fit``. A row shows the observed probability on the left and the modelled one on the right. If a model depends on
+    the tag's facing, a row has panels for tags that face towards, across and away."""
     facings = (1.0, 0.0, -1.0) if any(model.uses_facing for model in fit.models) else (0.0,)
     figure, axes = grid(len(fit.models), 1 + len(facings), 5.0 * len(fit.models))
     axis = np.arange(-VIEW, VIEW + 1e-9, STEP)

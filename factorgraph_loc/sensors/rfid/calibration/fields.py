@@ -35,11 +35,12 @@ MODEL_PAIRS = 40000  # maximum number of pairs for the fit of a parametric model
 
 
 def fit_grid(pairs: TagPairs, parametric: DetectionModel, smoothness: float, floor: Floor) -> GridModel:
-    """Return a detection grid fitted to the reads and misses of ``pairs``. Far from all data it equals ``parametric``.
+    """Return a detection model on a grid, fitted to the reads and misses of ``pairs``. Far from data it is
+    ``parametric``.
 
     ``smoothness``: weight of squared second differences of logits. ``floor``: probabilities of false reads and misses.
-    The grid has an axis for height if the heights of ``pairs`` differ, and an axis for facing if ``parametric`` depends
-    on the facing.
+    The grid has an axis for height if the heights of ``pairs`` differ. It has an axis for the tag's facing if
+    ``parametric`` depends on it.
     """
     base = bake(parametric, EXTENT, CELL, _heights(pairs), FACINGS if parametric.uses_facing else 1)
     shape = (base.logits.shape[0], 1, *base.logits.shape[2:])
@@ -71,8 +72,8 @@ def fit_grid(pairs: TagPairs, parametric: DetectionModel, smoothness: float, flo
 
 
 def _heights(pairs: TagPairs) -> list[float]:
-    """Return the heights [m] of the layers of a grid, as multiples of HEIGHT_STEP that cover nearly all ``pairs``. If
-    all pairs have nearly the same height, only this height is returned."""
+    """Return the heights [m] of the layers of a grid: multiples of HEIGHT_STEP that cover nearly all ``pairs``. If all
+    pairs have nearly the same height, only this height is returned."""
     low, high = np.quantile(pairs.points[:, 2], (0.01, 0.99)).tolist()
     if high - low < HEIGHT_STEP:
         return [round(0.5 * (low + high), 3)]
@@ -80,8 +81,8 @@ def _heights(pairs: TagPairs) -> list[float]:
 
 
 def design_of(grid: GridModel, points: Array, facing: Array) -> sparse.csr_array:
-    """Return the matrix (M, number of grid points) that interpolates logits of the grid at tags. ``points`` (M, 3):
-    positions of the tags in the antenna frame. ``facing`` (M,): see :class:`TagPairs`."""
+    """Return the sparse matrix (M, number of grid points) that interpolates the logits of ``grid`` at M tags.
+    ``points`` (M, 3): tag positions in the antenna frame [m]. ``facing`` (M,): see :class:`TagPairs`."""
     shape, heights = grid.logits.shape, grid.heights
     axes = [
         knots.linear((points[:, 2] - heights[0]) / (heights[1] - heights[0] if len(heights) > 1 else 1.0), shape[0]),
@@ -114,7 +115,7 @@ def _roughness(shape: Sequence[int]) -> sparse.csc_array:
 
 
 def _merged(pairs: TagPairs) -> TagPairs:
-    """Return pairs in which those with nearly equal positions and facings are merged, at their mean."""
+    """Return ``pairs`` with nearly equal positions and facings merged into one pair at their mean."""
     rows = np.column_stack((pairs.points, pairs.facing))
     first, cell = cells(rows, FINE)
     hits, count = by_block(np.column_stack((pairs.hits, pairs.count)), cell).T
@@ -125,7 +126,7 @@ def _merged(pairs: TagPairs) -> TagPairs:
 @dataclass(frozen=True)
 class Kind:
     """A kind of detection model. ``name``: "beam", "logistic" or "grid". ``facing``: True if the model depends on the
-    facing of tags. ``own``: True if each antenna has its own model."""
+    direction of the tag's front. ``own``: True if each antenna has its own model, False if all share one."""
 
     name: str
     facing: bool = False
@@ -138,9 +139,9 @@ class Kind:
 
 
 def fit(pairs: TagPairs, kind: Kind, floor: Floor, antennas: int) -> tuple[tuple[DetectionModel, ...], tuple[int, ...]]:
-    """Fit detection models of a kind to the reads and misses of ``pairs``. Returns the models, and the index of the
-    model of each antenna. Antennas without data get a model of all antennas. ``floor``: probabilities of false reads
-    and misses. ``antennas``: the number of antennas."""
+    """Return detection models of a ``kind``, fitted to the reads and misses of ``pairs``, and the index of the model of
+    each antenna. An antenna without data gets a model that is fitted to all antennas. ``floor``: probabilities of false
+    reads and misses. ``antennas``: the number of antennas."""
     if not kind.own:
         return (_fit_one(pairs, kind, floor),), (0,) * antennas
     active = [a for a in range(antennas) if np.any(pairs.antenna == a)]
@@ -151,7 +152,7 @@ def fit(pairs: TagPairs, kind: Kind, floor: Floor, antennas: int) -> tuple[tuple
 
 
 def choose(pairs: TagPairs, floor: Floor, antennas: int, *, facing: bool) -> tuple[Kind, dict[Kind, float]]:
-    """Choose a kind of detection model by cross-validation. Returns the best kind, and the score of each kind.
+    """Return the best kind of detection model by cross-validation, and the score of each kind.
 
     The score is the negative log-likelihood [nats per round] of held-out ``pairs``. A more complex model must be better
     than a simpler one by :data:`WORTH`. ``floor``: probabilities of false reads and misses. ``antennas``: the number of

@@ -67,9 +67,9 @@ BURSTS = 1.3  # minimum overdispersion for a change of the tempering
 
 @dataclass(frozen=True)
 class RfidFit:
-    """Fitted detection models and their data.
+    """Fitted detection models and their data, for the plots of the calibration report.
 
-    ``models``: the models. ``which``: the index of the model of each antenna. ``antennas``: names of the antennas.
+    ``models``: the models. ``which``: the index in ``models`` for each antenna. ``antennas``: names of the antennas.
     ``kind``: the kind of all models. ``pairs``: the reads and misses to which the models are fitted.
     """
 
@@ -81,7 +81,7 @@ class RfidFit:
 
 
 def learn_rfid(logs: Sequence[Log], rig: Rig, grids: Path, kind: Kind | None = None) -> SensorKnowledge:
-    """Estimate the RFID settings of ``rig`` from ``logs`` with references. Returns the result of the calibration.
+    """Return the RFID settings of ``rig``, estimated from ``logs`` with references, as the result of a calibration.
 
     If several logs have the same reads, only one is used. ``grids``: path and name prefix of files for detection grids.
     ``kind``: the kind of detection model, None to choose the best kind. Raises InputError if a log has too few rounds.
@@ -120,7 +120,7 @@ def learn_rfid(logs: Sequence[Log], rig: Rig, grids: Path, kind: Kind | None = N
 
 
 def relearn_rfid(traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path) -> SensorKnowledge:
-    """Estimate the RFID settings of ``rig`` from smoothed logs. Returns the result of the calibration.
+    """Return the RFID settings of ``rig``, estimated from the smoothed logs ``traced``, as the result of a calibration.
 
     ``rig``: the rig with which the logs were smoothed. ``first``: the rig before the first iteration of smoothing and
     calibration. Priors are around its values. ``grids``: path and name prefix of files for detection grids.
@@ -193,9 +193,9 @@ def _mean(
 def _refitted(
     pairs: TagPairs, initial: DetectionModel, name: str, floor: Floor
 ) -> tuple[DetectionModel, list[FittedConstant]] | None:
-    """Fit a detection model of the same kind as ``initial`` to ``pairs``. Returns the model and its parameters, or None
-    if it is a beam that ``pairs`` do not determine. ``name``: the name of the model. ``floor``: probabilities of false
-    reads and misses."""
+    """Return a detection model of the same kind as ``initial``, fitted to ``pairs``, and its parameters. Returns None
+    for a beam model that ``pairs`` do not determine. ``name``: the name of the model. ``floor``: minimum
+    probabilities."""
     family = family_of(initial, pairs)
     model, posterior = fit_model(pairs, family, floor)
     if isinstance(initial, BeamModel) and np.any(posterior.errors > VAGUE * np.abs(posterior.values)):
@@ -209,8 +209,8 @@ def _refitted(
 
 
 def _prior(traced: Sequence[Traced], labels: Sequence[str]) -> PriorSettings:
-    """Return the standard deviations, between logs, of the range and the read rate that the smoother estimated for a
-    model. ``labels``: the names of the two parameters in the logs."""
+    """Return the scatter between logs of the range and of the read rate of a detection model, as the model's prior. The
+    values of each log were estimated by the smoother. ``labels``: the names of both parameters in ``traced``."""
     scatters = {}
     for kind, label in zip(OF_MODEL, labels, strict=True):
         if corrections := corrections_of(f"rfid.{label}", traced):
@@ -240,13 +240,13 @@ def _sampled_rounds(trace: Traced, settings: RfidSettings) -> Rounds:
 
 def _overdispersion(pairs: TagPairs, logit: Array, floor: Floor) -> tuple[float, float]:
     """Return the overdispersion of the reads in ``pairs`` and its standard error, see :func:`.overdispersion`.
-    ``logit`` (M,): predicted logits of a read."""
+    ``logit`` (M,): predicted logits of the probability of a read."""
     return overdispersion(pairs.hits, pairs.count, floor.probability(logit), pairs.antenna, pairs.tag, pairs.block)
 
 
 def _geometry_by_phases(logs: Sequence[Log], settings: RfidSettings, survey: SurveySettings) -> PhaseFit | None:
-    """Estimate the survey transform and the lever arm from phases. Returns None if there are too few phases, or if the
-    phases do not agree better with the estimates than with ``survey`` and ``settings``."""
+    """Return the survey transform and the lever arm estimated from phases. Returns None if there are too few phases, or
+    if the phases do not agree better with the estimates than with ``survey`` and ``settings``."""
     try:
         phase = fit_phase(logs, settings, survey)
     except InputError:
@@ -270,7 +270,7 @@ def floor_of(settings: RfidSettings) -> Floor:
 
 
 def _about_the_middle(rounds: Sequence[Rounds], survey: SurveySettings) -> SurveySettings:
-    """Return an identity transform with a rotation about the centre of the tags, so that translation and rotation are
+    """Return an identity transform that rotates about the centre of the tags, so that translation and rotation are
     uncorrelated. If ``survey`` is not the default, it is returned unchanged."""
     if survey != SurveySettings():
         return survey
@@ -282,7 +282,7 @@ def _about_the_middle(rounds: Sequence[Rounds], survey: SurveySettings) -> Surve
 def _with_models(
     settings: RfidSettings, models: Sequence[DetectionModel], which: Sequence[int], grids: Path, floor: Floor
 ) -> RfidSettings:
-    """Return ``settings`` with fitted detection models. Detection grids are written to files with the path prefix
+    """Return ``settings`` with the fitted detection ``models``. Grids are written to files with the path prefix
     ``grids``. ``which``: the index of the model of each antenna. ``floor``: probabilities of false reads and misses."""
     antennas = dict(settings.all_antennas())
     names = [DEFAULT] * len(models)

@@ -21,11 +21,11 @@ BLOCKS = 4  # number of folds for cross-validation if there is only one log; oth
 
 @dataclass(frozen=True, eq=False)
 class TagPairs:
-    """M pairs of an antenna pose and a tag, with the number of reads: the data to which detection models are fitted.
+    """M pairs of an antenna pose and a tag, with the number of reads. Detection models are fitted to them.
 
     ``points`` (M, 3): position of the tag in the antenna frame [m].
-    ``facing`` (M,): cosine of the angle between the tag's facing and the direction to the antenna, 0 if unknown.
-    ``count`` (M,): number of rounds. ``hits`` (M,): number of rounds that read the tag.
+    ``facing`` (M,): cosine of the angle between the direction of the tag's front and the direction to the antenna, or 0.
+    ``count`` (M,): number of inventory rounds. ``hits`` (M,): number of rounds that read the tag.
     ``antenna``, ``tag`` (M,): index of the antenna in the rig, and of the tag among all logs.
     ``fold`` (M,): number of the fold for cross-validation. ``block`` (M,): number of the time block.
     """
@@ -40,14 +40,14 @@ class TagPairs:
     block: Integers
 
     def part(self, keep: NDArray[np.bool_] | Integers) -> TagPairs:
-        """Return only the pairs that ``keep``, a mask (M,) or indices, selects."""
+        """Return the selected pairs. ``keep``: a mask (M,) or the indices of the pairs."""
         return replace(self, **{f.name: getattr(self, f.name)[keep] for f in fields(self)})
 
 
 @dataclass(frozen=True, eq=False)
 class Terms:
-    """The likelihood of M pairs. ``nll`` (M,): negative log-likelihood. ``gradient`` (M,): its derivative by the logit
-    of a read. ``information`` (M,): Fisher information on the logit."""
+    """The likelihood of M pairs of an antenna pose and a tag. ``nll`` (M,): negative log-likelihood. ``gradient`` (M,):
+    its derivative by the logit of the read probability. ``information`` (M,): Fisher information on this logit."""
 
     nll: Array
     gradient: Array
@@ -61,10 +61,10 @@ def pairs_of(
     within: Sequence[Integers] | None = None,
     length: float = BLOCK,
 ) -> TagPairs:
-    """Return the pairs of antenna pose and tag in several logs.
+    """Return all pairs of an antenna pose and a tag nearby in several logs, with their reads.
 
-    ``survey``: the transform of the tags to the world frame. ``within``: the result of :func:`nearby` for each log,
-    None to compute it. ``length``: length of the time blocks [s].
+    ``settings``: mounting of the antennas. ``survey``: the transform of the tags to the world frame. ``within``: the
+    result of :func:`nearby` for each log, None to compute it. ``length``: length of the time blocks [s].
     """
     numbers = {name: i for i, name in enumerate(dict.fromkeys(name for log in logs for name in log.names))}
     parts = []
@@ -86,16 +86,17 @@ def pairs_of(
 
 
 def nearby(log: Rounds, settings: RfidSettings, survey: SurveySettings) -> Integers:
-    """Return the indices of all pairs closer than :data:`REACH`. The index of round k and tag t of T is k T + t."""
+    """Return the indices of all pairs of a round and a tag with a distance below :data:`REACH`. The pair of round k and
+    tag t of T tags has the index k T + t."""
     every = np.arange(log.hits.size)
     return every[view_of(log, settings, survey, every)[1] < REACH]
 
 
 def view_of(log: Rounds, settings: RfidSettings, survey: SurveySettings, pairs: Integers) -> tuple[Array, Array]:
-    """Return the geometry of M pairs of a log. ``pairs`` (M,): indices of the pairs as in :func:`nearby`.
+    """Return the position and facing (M, 4) of the tag in M pairs, and the distance (M,) from antenna to tag [m].
 
-    Returns an array (M, 4) with the tag's position in the antenna frame [m] and its facing as in :class:`TagPairs`, and
-    the horizontal distance (M,) from antenna to tag [m].
+    The columns are x, y, z of the tag in the antenna frame [m], and ``facing`` as in :class:`TagPairs`. The distance is
+    horizontal. ``pairs`` (M,): indices of the pairs of a round and a tag, as in :func:`nearby`.
     """
     row, column = np.divmod(pairs, len(log.names))
     transform = survey.transform()
@@ -117,21 +118,21 @@ def view_of(log: Rounds, settings: RfidSettings, survey: SurveySettings, pairs: 
 
 @dataclass(frozen=True)
 class Floor:
-    """Lower bounds of probabilities. ``false_read``: the minimum probability of a read, at any position of the tag.
-    ``miss``: the minimum probability of a miss."""
+    """Bounds of the probability of a read. ``false_read``: its minimum at any position of the tag. ``miss``: the
+    minimum probability that a tag is not read."""
 
     false_read: float = 0.02
     miss: float = 0.02
 
     def probability(self, logit: Array) -> Array:
-        """Return the probability of a read, within the bounds, for the logit of a detection model."""
+        """Return the probability (M,) of a read, within the bounds, for ``logit`` (M,) of a detection model."""
         sigmoid = 1.0 / (1.0 + np.exp(-np.maximum(logit, NEGLIGIBLE_LOGIT)))
         return np.asarray(self.false_read + (1.0 - self.false_read - self.miss) * sigmoid)
 
 
 def terms(logit: Array, hits: Array, count: Array, floor: Floor) -> Terms:
-    """Return the binomial likelihood of ``hits`` (M,) reads in ``count`` (M,) rounds. ``logit`` (M,): logits of a read
-    by a detection model. ``floor``: probabilities of false reads and misses."""
+    """Return the binomial likelihood of ``hits`` (M,) reads in ``count`` (M,) rounds. ``logit`` (M,): logits of the
+    read probability by a detection model. ``floor``: probabilities of false reads and misses."""
     q = np.clip(floor.probability(logit), 1e-12, 1.0 - 1e-12)
     by_logit = (q - floor.false_read) * (1.0 - floor.miss - q) / (1.0 - floor.false_read - floor.miss)
     return Terms(
@@ -142,7 +143,8 @@ def terms(logit: Array, hits: Array, count: Array, floor: Floor) -> Terms:
 
 
 def modelled(models: Sequence[DetectionModel], which: Sequence[int], pairs: TagPairs) -> Array:
-    """Return the logits (M,) of a read that ``models`` predict for ``pairs``. Antenna i has ``models[which[i]]``."""
+    """Return the logits (M,) of the read probability that ``models`` predict for M ``pairs`` of an antenna pose and a
+    tag. ``which``: the index in ``models`` for each antenna."""
     out = np.empty(len(pairs.facing))
     mine = np.asarray(which)[pairs.antenna]
     for i, model in enumerate(models):

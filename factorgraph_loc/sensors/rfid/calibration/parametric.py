@@ -48,7 +48,7 @@ class Family:
 
     ``parameters``: the P parameters with priors. ``built``: a function from values (P,) of the parameters to the model.
     ``design``: a function from points (M, 3) and facings (M,) to the derivatives (M, P) of the logit of a read by the
-    parameters. It is None if the logit is not linear in the parameters.
+    parameters. It is None if the logit is not linear in the parameters. For points and facings see :class:`TagPairs`.
     """
 
     parameters: tuple[Parameter, ...]
@@ -56,10 +56,11 @@ class Family:
     design: Callable[[Array, Array], Array] | None = None
 
     def jacobian(self, values: Array, points: Array, facing: Array) -> Array:
-        """Return the derivatives (M, P) of the logit of a read by the parameters, at their ``values`` (P,).
+        """Return the derivatives (M, P) of the logit of the read probability by the parameters. ``values`` (P,): the
+        parameters.
 
         ``points`` (M, 3): positions of tags in the antenna frame [m]. ``facing`` (M,): cosine of the angle between the
-        tag's facing and the direction to the antenna.
+        direction of the tag's front and the direction to the antenna.
         """
         if self.design is not None:
             return self.design(points, facing)
@@ -79,9 +80,9 @@ def features(points: Array, facing: Array) -> Array:
 
 
 def logistic(pairs: TagPairs, *, with_facing: bool) -> Family:
-    """Return the family of logistic models. The coefficients have Gaussian priors with mean 0. The prior standard
-    deviation of a coefficient is 1 over the standard deviation of its feature in ``pairs``. The constant has a flat
-    prior. ``with_facing``: True to use the features that depend on the facing of tags."""
+    """Return the family of logistic models. Coefficients have Gaussian priors with mean 0. Their standard deviations
+    are 1 over the standard deviation of the feature in ``pairs``. The constant has a flat prior. ``with_facing``: True
+    to use the features that depend on the facing of tags."""
     every = _with_edge_misses(pairs)
     scale = np.std(features(every.points, every.facing), axis=0)
     used = [i for i in range(len(FEATURES)) if i == 0 or (scale[i] > 1e-6 and (with_facing or i not in FACING))]
@@ -147,8 +148,8 @@ def fit_model(pairs: TagPairs, family: Family, floor: Floor) -> tuple[DetectionM
 def geometry_parameters(
     settings: RfidSettings, focus: Mapping[str, tuple[float, float]] = NO_FOCUS
 ) -> tuple[tuple[Parameter, ...], Array]:
-    """Return the changes of the survey transform and of the mounting of each antenna as P parameters, and the
-    covariance (P, P) of their prior.
+    """Return P parameters and the covariance (P, P) of their prior. The parameters are changes of the survey transform
+    and of the mounting of each antenna.
 
     The change of an antenna is a change that all antennas share, plus an own change if there are several antennas.
     ``focus``: priors (mean, standard deviation) of changes by name, which replace the default priors.
@@ -169,7 +170,7 @@ def geometry_parameters(
 
 
 def kind_of(parameter: Parameter) -> tuple[str, str]:
-    """Split the name of a parameter of :func:`geometry_parameters` into a key of SURVEY or COMMON, and the name of the
+    """Return the kind of a parameter of :func:`geometry_parameters`, a key of SURVEY or COMMON, and the name of its
     antenna. The antenna is "" for the survey."""
     what, _, rest = parameter.name.partition(".")
     antenna, _, name = rest.rpartition(".")
@@ -225,7 +226,7 @@ def estimate_geometry(
 def with_changes(
     settings: RfidSettings, survey: SurveySettings, places: Sequence[Parameter], changes: Array
 ) -> tuple[RfidSettings, SurveySettings]:
-    """Return ``settings`` and ``survey`` after ``changes`` (P,) of the parameters ``places``, see
+    """Return ``settings`` and ``survey`` with the values ``changes`` (P,) of the parameters ``places`` added. See
     :func:`geometry_parameters`."""
     antennas = dict(settings.all_antennas())
     for place, change in zip(places, changes.tolist(), strict=True):
@@ -249,9 +250,9 @@ def pose_share(
     which: Sequence[int],
     floor: Floor,
 ) -> float:
-    """Return the information of the reads on the pose, divided by the information if all reads were independent. Reads
-    in a time window are correlated, so that the result is below 1. ``logs``: rounds that are not merged. ``which``: the
-    index in ``models`` of the model of each antenna. ``floor``: probabilities of false reads and misses."""
+    """Return the Fisher information of the reads on the pose, divided by its value for independent reads. It is below 1
+    because reads in a time window are correlated. ``logs``: rounds that are not merged. ``which``: the index in
+    ``models`` for each antenna. ``floor``: probabilities of false reads and misses."""
     within = [nearby(log, settings, survey) for log in logs]
     pairs = pairs_of(logs, settings, survey, within, WINDOW)
     logit, columns = modelled(models, which, pairs), []
@@ -263,8 +264,8 @@ def pose_share(
 
 
 def _evidence(logit: Array, jacobian: Array, pairs: TagPairs, floor: Floor, block: Integers) -> LikelihoodTerms:
-    """Return the likelihood of ``pairs``. ``logit`` (M,): predicted logits of a read. ``jacobian`` (M, P): their
-    derivatives by P parameters. ``block`` (M,): pairs with the same number are treated as correlated."""
+    """Return the likelihood of ``pairs``. ``logit`` (M,): predicted logits of the read probability. ``jacobian``
+    (M, P): their derivatives by P parameters. ``block`` (M,): pairs with the same number are treated as correlated."""
     likelihood = terms(logit, pairs.hits, pairs.count, floor)
     information = jacobian.T @ (likelihood.information[:, None] * jacobian)
     scores = by_block(likelihood.gradient[:, None] * jacobian, block)

@@ -34,8 +34,8 @@ class Rounds:
     """Inventory rounds of a log at K robot poses, and the T tags of the map that are read at least once.
 
     ``log``: the name of the log. ``t`` (K,): times [s]. ``poses`` (K, 3): robot poses. ``antenna`` (K,): the antenna of
-    the rounds, as index in the rig. ``count`` (K,): weighted number of rounds. ``hits`` (K, T): weighted number of
-    rounds that read each tag. ``tags``: positions and facings of the tags in the survey frame. ``names``: T EPCs.
+    the rounds, as index in the rig. ``count`` (K,): weighted number of rounds. ``hits`` (K, T): number of rounds that
+    read each tag, with the same weights. ``tags``: positions and facings in the survey frame. ``names``: T EPCs.
     """
 
     log: str
@@ -48,13 +48,13 @@ class Rounds:
     names: tuple[str, ...]
 
     def part(self, keep: NDArray[np.bool_] | Integers) -> Rounds:
-        """Return only the poses that ``keep``, a mask (K,) or indices, selects, with all tags."""
+        """Return a copy with only the selected poses. ``keep``: a mask (K,) or the indices of the poses."""
         columns = ("t", "poses", "antenna", "count", "hits")
         return replace(self, **{name: getattr(self, name)[keep] for name in columns})
 
 
 def rounds_of(log: Log, settings: RfidSettings, *, merged: bool = True) -> Rounds:
-    """Return the rounds of a log for which the reference has a pose. Unknown tags and antennas are omitted.
+    """Return the inventory rounds of a log at reference poses. Tags and antennas that are unknown are omitted.
 
     ``merged``: True to merge rounds at nearly equal poses. The time of a round is the middle of its reads. Raises
     InputError if the log has too few rounds, or reads of too few tags.
@@ -87,8 +87,8 @@ def rounds_of(log: Log, settings: RfidSettings, *, merged: bool = True) -> Round
 
 
 def _middle(age: Array, inverse: Integers, read: NDArray[np.bool_], count: int) -> Array:
-    """Return the time (R,) [s] from the middle of the reads of each of R = ``count`` rounds to the end of the round. A
-    round without reads gets the median time. ``age`` (N,): age [s] of each row, see :class:`RfidStream`. ``inverse``
+    """Return the age (R,) [s] of the middle of the reads of R = ``count`` rounds, relative to the end of each round. A
+    round without reads gets the median age. ``age`` (N,): age [s] of each row, see :class:`RfidStream`. ``inverse``
     (N,): the round of each row. ``read`` (N,): True for rows with a read."""
     oldest, youngest = np.full(count, -np.inf), np.full(count, np.inf)
     np.maximum.at(oldest, inverse[read], age[read])
@@ -101,8 +101,8 @@ def _middle(age: Array, inverse: Integers, read: NDArray[np.bool_], count: int) 
 
 
 def cells(coordinates: Array, sizes: tuple[float, ...]) -> tuple[Integers, Integers]:
-    """Assign points to cells of a grid. ``coordinates`` (M, D): the points. ``sizes`` (D,): the size of a cell. Returns
-    the index of the first point in each occupied cell, and the cell number (M,) of each point."""
+    """Return the index of the first point in each occupied cell of a grid, and the cell number (M,) of each point.
+    ``coordinates`` (M, D): the points. ``sizes`` (D,): the size of a cell."""
     keys = np.floor(coordinates / sizes).astype(np.int64)
     keys -= keys.min(axis=0)
     flat = np.ravel_multi_index(tuple(keys.T), tuple(keys.max(axis=0) + 1))
@@ -115,10 +115,10 @@ def overdispersion(
 ) -> tuple[float, float]:
     """Return the overdispersion of reads, at least 1, and its standard error.
 
-    The overdispersion is the variance of the number of reads of a tag by an antenna in a time block, divided by the
-    variance for independent reads (McCullagh and Nelder, "Generalized linear models", 1989, section 4.5). If it is n, n
-    correlated rounds have as much information as one independent round. ``hits``, ``count`` (M,): numbers of reads and
-    of rounds. ``p`` (M,): predicted probability of a read in one round. ``antenna``, ``tag``, ``block`` (M,): indices.
+    The variance of the number of reads of a tag by an antenna in a time block is divided by its value for independent
+    reads (McCullagh and Nelder, "Generalized linear models", 1989, section 4.5). If the result is n, n correlated
+    rounds have as much information as one independent round. ``hits``, ``count`` (M,): numbers of reads and of rounds.
+    ``p`` (M,): predicted probability of a read in one round. ``antenna``, ``tag``, ``block`` (M,): their numbers.
     """
     first, cell = cells(np.column_stack((block, tag, antenna)), (1.0, 1.0, 1.0))
     excess, variance = np.bincount(cell, hits - count * p), np.bincount(cell, count * p * (1.0 - p))
@@ -130,7 +130,7 @@ def overdispersion(
 
 
 def _merged(rounds: Rounds) -> Rounds:
-    """Return rounds in which those of the same antenna at nearly equal poses are merged, at their mean pose."""
+    """Return ``rounds`` with those of the same antenna at nearly equal poses merged at their mean pose."""
     first, cell = cells(np.column_stack((rounds.poses, rounds.antenna)), CELL)
     size = np.bincount(cell).astype(float)
     weight = np.minimum(1.0, MOST_ROUNDS / size)

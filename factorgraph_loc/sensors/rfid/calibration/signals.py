@@ -55,10 +55,11 @@ class PhaseFit:
 
 
 def fit_phase(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings | None = None) -> PhaseFit:
-    """Return the survey transform and the lever arm with which the phases in ``logs`` agree best.
+    """Return the survey transform and the correction of antenna positions that maximise the agreement of phases.
 
-    All logs must have the same world. ``survey``: the initial survey transform. Standard deviations are estimated by a
-    jackknife over time blocks. Raises InputError if a log has no reference, or if too few phases are near their tags.
+    All ``logs`` must have the same world. ``survey``: the initial survey transform. Standard deviations are estimated
+    by a jackknife over time blocks. Raises InputError if a log has no reference, or if too few phases are near their
+    tags.
     """
     start = survey or SurveySettings()
     focus = _Focus.of(logs, rfid, start)
@@ -81,8 +82,9 @@ def fit_phase(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings | 
 class _Focus:
     """The agreement of phases along references as a function of a state (5,).
 
-    The state is x, y, heading of the survey transform and x, y of the lever arm. ``reads``: the reads with a phase.
-    ``model``: the model of phases. ``tags``: the tags in the survey frame. ``initial``: the initial survey transform.
+    The state is x, y, heading of the survey transform, and a correction of x, y of all antennas. ``reads``: the reads
+    with a phase. ``model``: the model of phases. ``tags``: the tags in the survey frame. ``initial``: the initial
+    transform.
     """
 
     reads: PhaseReads
@@ -157,8 +159,9 @@ DOF = (1.0, 100.0)  # bounds of the degrees of freedom of the noise
 def fit_rssi(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings) -> RssiSettings:
     """Return the maximum likelihood model of signal strength (:mod:`factors.rfid.signals`) for all ``logs``.
 
-    The fitted path loss is smaller than in free space, because signals below the sensitivity of the reader are missing.
-    Raises InputError if a log has no reference, or if too few reads have an RSSI.
+    ``survey``: the transform of the tags to the world frame. Limitation: the fitted path loss is smaller than in free
+    space, because signals below the sensitivity of the reader are missing. Raises InputError if a log has no reference,
+    or if too few reads have an RSSI.
     """
     names = {name: i for i, name in enumerate(rfid.all_antennas())}
     tables, values = list[Array](), list[Array]()
@@ -178,8 +181,8 @@ def fit_rssi(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings) ->
 
 
 def _student(x: Array, y: Array) -> tuple[Array, float, float]:
-    """Fit a linear model with Student-t noise to ``y`` (N,) and features ``x`` (N, F). Returns the coefficients (F,),
-    and the scale and degrees of freedom of the noise. Source: Liu, Rubin, Statistica Sinica 5, 1995."""
+    """Return the coefficients (F,) of a linear model with Student-t noise, and the scale and degrees of freedom of the
+    noise. The model predicts ``y`` (N,) from features ``x`` (N, F). Source: Liu, Rubin, Statistica Sinica 5, 1995."""
     dof, weights = 5.0, np.ones(len(y))
     for _ in range(ITERATIONS):
         root = np.sqrt(weights)
