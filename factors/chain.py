@@ -97,10 +97,11 @@ def _subtract(left: Array, right: Array, out: Array) -> None:
 def _eliminated(system: System, damping: float) -> tuple[bool, Array, Array, Array, Array]:
     """Eliminate the N poses of ``system`` in order, after multiplying the diagonal by ``1 + damping``.
 
-    Returns True if the poses are determined, and four arrays for the back substitution: the inverse of each pose's
-    reduced diagonal block (N, 3, 3), this inverse times the block of the pose and the next pose (N, 3, 3), this inverse
-    times the block of the pose, the parameters and the gradient (N, 3, P + 1), and the reduced block of the parameters
-    (P + 1, P + 1)."""
+    Returns True if the poses are determined, and four arrays to use in the back substitution. The first is the inverse
+    of each pose's reduced diagonal block (N, 3, 3). The next two are this inverse times the block of the pose and the
+    next pose (N, 3, 3), and times that of the pose, the parameters and the gradient (N, 3, P + 1). The last is the
+    reduced block of the parameters (P + 1, P + 1).
+    """
     own, coupling, side, corner = system
     count, shared = len(own), len(corner) - 1
     inverses, by_next, by_side = np.zeros_like(own), np.zeros_like(own), np.zeros_like(side)

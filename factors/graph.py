@@ -116,8 +116,8 @@ class Factor(Protocol):
 
 class Stack(Protocol):
     """Many factors of one kind that are linearised by one call, for speed. Each factor depends on one of N poses or on
-    two consecutive poses, and on some of P parameters of the graph, such as sensor constants. ``rows``: the number M of
-    all residuals."""
+    two consecutive poses. It also depends on some of P parameters of the graph, such as sensor constants. ``rows``: the
+    number M of all residuals."""
 
     rows: int
 

@@ -79,7 +79,8 @@ def root(covariances: Array) -> Array:
 
 
 def solve(covariances: Array, right: Array) -> Array:
-    """Solve ``covariances @ x = right`` for covariances (..., D, D) and ``right`` (..., D, N). Returns x (..., D, N)."""
+    """Solve ``covariances @ x = right``. Shapes: covariances (..., D, D), ``right`` (..., D, N). Returns x (..., D,
+    N)."""
     try:
         return np.asarray(np.linalg.solve(covariances, right))
     except np.linalg.LinAlgError:
@@ -136,7 +137,7 @@ def draws(covariance: Array, count: int, rng: np.random.Generator) -> Array:
 
 
 def _whitener(covariances: Array) -> Array:
-    """Compute :func:`whitener` from the eigenvalues of the correlation matrices. Eigenvalues below :data:`LEAST` are raised."""
+    """Compute :func:`whitener` by eigenvalues of correlation matrices. Eigenvalues below :data:`LEAST` are raised."""
     sigmas, values, vectors = _parts(covariances)
     return np.asarray(np.swapaxes(vectors / np.sqrt(values)[..., None, :], -1, -2) / sigmas[..., None, :])
 

@@ -18,21 +18,21 @@ Squared = TypeVar("Squared", float, Array)
 
 @register_jitable(inline="always")
 def geman_mcclure_loss(squared: Squared, scale: float) -> Squared:
-    """The loss of Geman and McClure (1985) for ``squared`` whitened residuals. It is at most ``scale^2 / 2``, so that
-    gross outliers have no influence. ``scale``: in standard deviations."""
+    """Return the loss of Geman and McClure (1985) for ``squared``, the squared norms of whitened residuals. It is at
+    most ``scale^2 / 2``, so that gross outliers have no influence. ``scale``: in standard deviations."""
     return 0.5 * squared / (1.0 + squared / scale**2)
 
 
 @register_jitable(inline="always")
 def geman_mcclure_weight(squared: Squared, scale: float) -> Squared:
-    """The weight of ``squared`` residuals in iteratively reweighted least squares with :func:`geman_mcclure_loss`."""
+    """Return the weights in iteratively reweighted least squares with :func:`geman_mcclure_loss`. Same arguments."""
     return (1.0 + squared / scale**2) ** -2
 
 
 @register_jitable(inline="always")
 def huber_loss(squared: Squared, scale: float) -> Squared:
-    """The loss of Huber (1964) for ``squared`` whitened residuals. It is linear in the residual beyond ``scale``
-    standard deviations."""
+    """Return the loss of Huber (1964) for ``squared``, the squared norms of whitened residuals. It is linear in the
+    residual beyond ``scale`` standard deviations."""
     size = np.sqrt(squared)
     inner = np.minimum(size, scale)
     loss: Squared = inner * (size - 0.5 * inner)
@@ -41,6 +41,6 @@ def huber_loss(squared: Squared, scale: float) -> Squared:
 
 @register_jitable(inline="always")
 def huber_weight(squared: Squared, scale: float) -> Squared:
-    """The weight of ``squared`` residuals in iteratively reweighted least squares with :func:`huber_loss`."""
+    """Return the weights in iteratively reweighted least squares with :func:`huber_loss`. Same arguments."""
     weight: Squared = scale / np.maximum(np.sqrt(squared), scale)
     return weight

@@ -24,18 +24,18 @@ SHORT = 0.5  # rad; functions of many poses use a longer Taylor series below thi
 
 
 def wrap(angle: Array) -> Array:
-    """Angles in radians, wrapped to (-pi, pi]."""
+    """Return angles [rad], wrapped to (-pi, pi]."""
     return np.pi - np.mod(np.pi - np.asarray(angle, dtype=float), 2.0 * np.pi)
 
 
 @register_jitable
 def wrap_scalar(angle: float) -> float:
-    """One angle in radians, wrapped to (-pi, pi]."""
+    """Return one angle [rad], wrapped to (-pi, pi]."""
     return math.pi - (math.pi - angle) % (2.0 * math.pi)
 
 
 def compose(a: Array, b: Array) -> Array:
-    """The pose ``a * b``: ``b``, given in the frame of ``a``, expressed in the frame of ``a``'s parent."""
+    """Return the pose ``a * b`` (..., 3): ``b`` is given in the frame of ``a``, the result in the parent of ``a``."""
     a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
     if a.ndim == b.ndim == 1:
         return np.array(compose_scalars(*a.tolist(), *b.tolist()))
@@ -48,7 +48,7 @@ def compose(a: Array, b: Array) -> Array:
 
 
 def inverse(a: Array) -> Array:
-    """The pose ``a^-1``."""
+    """Return the pose ``a^-1`` (..., 3), the parent frame in the frame of ``a``."""
     a = np.asarray(a, dtype=float)
     if a.ndim == 1:
         x, y, heading = a.tolist()
@@ -62,7 +62,7 @@ def inverse(a: Array) -> Array:
 
 
 def between(a: Array, b: Array) -> Array:
-    """The pose of ``b`` in the frame of ``a``: ``a^-1 * b``."""
+    """Return the pose ``a^-1 * b`` (..., 3), which is ``b`` in the frame of ``a``."""
     a, b = np.asarray(a, dtype=float), np.asarray(b, dtype=float)
     if a.ndim == b.ndim == 1:
         return np.array(between_scalars(*a.tolist(), *b.tolist()))
@@ -70,7 +70,7 @@ def between(a: Array, b: Array) -> Array:
 
 
 def exp(xi: Array) -> Array:
-    """The pose reached by following the twist ``xi`` for unit time: an arc of a circle."""
+    """Return the pose (..., 3) after following the twist ``xi`` (..., 3) for unit time: an arc of a circle."""
     xi = np.asarray(xi, dtype=float)
     if xi.ndim == 1:
         return np.array(exp_scalars(*xi.tolist()))
@@ -83,7 +83,7 @@ def exp(xi: Array) -> Array:
 
 
 def log(pose: Array) -> Array:
-    """The twist that leads from the origin to ``pose`` in unit time; the inverse of :func:`exp` for |heading| < pi."""
+    """Return the twist (..., 3) from the origin to ``pose`` in unit time. Inverts :func:`exp` for headings below pi."""
     pose = np.asarray(pose, dtype=float)
     if pose.ndim == 1:
         return np.array(log_scalars(*pose.tolist()))
@@ -98,7 +98,7 @@ def log(pose: Array) -> Array:
 
 
 def adjoint(pose: Array) -> Array:
-    """The adjoint matrix ``(..., 3, 3)``: ``pose * exp(xi) = exp(adjoint(pose) xi) * pose``."""
+    """Return the adjoint matrix A (..., 3, 3) of a pose: ``pose * exp(xi) = exp(A xi) * pose`` for a twist ``xi``."""
     pose = np.asarray(pose, dtype=float)
     out = _rotation3(pose[..., 2])
     out[..., 0, 2], out[..., 1, 2] = pose[..., 1], -pose[..., 0]
@@ -106,7 +106,7 @@ def adjoint(pose: Array) -> Array:
 
 
 def transform_to(pose: Array, points: Array) -> Array:
-    """Points ``(..., 2)`` of the parent frame, expressed in the frame of ``pose``."""
+    """Return ``points`` (..., 2) of the parent frame, expressed in the frame of ``pose``."""
     pose, points = np.asarray(pose, dtype=float), np.asarray(points, dtype=float)
     c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
     dx, dy = points[..., 0] - pose[..., 0], points[..., 1] - pose[..., 1]
@@ -117,7 +117,7 @@ def transform_to(pose: Array, points: Array) -> Array:
 
 
 def transform_from(pose: Array, points: Array) -> Array:
-    """Points ``(..., 2)`` in the frame of ``pose``, expressed in the parent frame; the inverse of :func:`transform_to`."""
+    """Return ``points`` (..., 2) of the frame of ``pose`` in the parent frame, the inverse of :func:`transform_to`."""
     pose, points = np.asarray(pose, dtype=float), np.asarray(points, dtype=float)
     c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
     x = pose[..., 0] + c * points[..., 0] - s * points[..., 1]
@@ -126,7 +126,7 @@ def transform_from(pose: Array, points: Array) -> Array:
 
 
 def align_points(points: Array, targets: Array) -> Array:
-    """The pose (3,) that moves ``points`` (N, 2) onto ``targets`` (N, 2) with the least squared distances.
+    """Return the pose (3,) that moves ``points`` (N, 2) onto ``targets`` (N, 2) with the least squared distances.
 
     Pairs that contain a NaN are ignored. If no pair is left, the result is NaN. If all points coincide, the rotation is
     0. Source: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", PAMI 13(4),
@@ -143,20 +143,20 @@ def align_points(points: Array, targets: Array) -> Array:
 
 
 def body_to_world(pose: Array, covariance: Array) -> Array:
-    """Convert a covariance ``(..., 3, 3)`` of the body-frame perturbation to one of ``(x, y, heading)`` in the world."""
+    """Return the covariance (..., 3, 3) of (x, y, heading) in the world, from that of the body-frame perturbation."""
     rotation = _rotation3(np.asarray(pose, dtype=float)[..., 2])
     return rotation @ covariance @ rotation.mT
 
 
 def world_to_body(pose: Array, covariance: Array) -> Array:
-    """Convert a covariance ``(..., 3, 3)`` of ``(x, y, heading)`` in the world to one of the body-frame perturbation."""
+    """Return the covariance (..., 3, 3) of the body-frame perturbation, from that of (x, y, heading) in the world."""
     rotation = _rotation3(np.asarray(pose, dtype=float)[..., 2])
     return rotation.mT @ covariance @ rotation
 
 
 @register_jitable
 def arc_coefficients(phi: float) -> tuple[float, float]:
-    """``sin(phi) / phi`` and ``(1 - cos(phi)) / phi`` of one angle [rad]. Compiled code may call this function."""
+    """Return ``sin(phi) / phi`` and ``(1 - cos(phi)) / phi`` of one angle [rad]. Compiled code may call it."""
     if abs(phi) < SMALL:
         return 1.0 - phi * phi / 6.0, phi / 2.0
     return math.sin(phi) / phi, 2.0 * math.sin(phi / 2.0) ** 2 / phi
@@ -173,7 +173,7 @@ def _arc_coefficients(phi: Array) -> tuple[Array, Array]:
 
 
 def _rotation3(heading: Array) -> Array:
-    """The matrices (..., 3, 3) that rotate the first two components by ``heading`` (...) and keep the third."""
+    """Return the matrices (..., 3, 3) that rotate the first two components by ``heading`` (...) and keep the third."""
     if np.ndim(heading) == 0:
         cos, sin = math.cos(heading), math.sin(heading)
         return np.array(((cos, -sin, 0.0), (sin, cos, 0.0), (0.0, 0.0, 1.0)))
@@ -204,14 +204,14 @@ def _wrapped_of_many(angle: float) -> float:
 
 @compiled
 def exp_scalars(x: float, y: float, angle: float) -> tuple[float, float, float]:
-    """:func:`exp` of one twist (x, y, angle)."""
+    """Return :func:`exp` of one twist (x, y, angle) as three numbers."""
     p, q = arc_coefficients(angle)
     return p * x - q * y, q * x + p * y, wrap_scalar(angle)
 
 
 @compiled
 def log_scalars(x: float, y: float, heading: float) -> tuple[float, float, float]:
-    """:func:`log` of one pose (x, y, heading)."""
+    """Return :func:`log` of one pose (x, y, heading) as three numbers."""
     angle = wrap_scalar(heading)
     p, q = arc_coefficients(angle)
     scale = 1.0 / (p * p + q * q)
@@ -222,7 +222,7 @@ def log_scalars(x: float, y: float, heading: float) -> tuple[float, float, float
 def compose_scalars(
     x: float, y: float, heading: float, dx: float, dy: float, turned: float
 ) -> tuple[float, float, float]:
-    """:func:`compose` of the poses (x, y, heading) and (dx, dy, turned)."""
+    """Return :func:`compose` of the poses (x, y, heading) and (dx, dy, turned) as three numbers."""
     c, s = math.cos(heading), math.sin(heading)
     return x + c * dx - s * dy, y + s * dx + c * dy, wrap_scalar(heading + turned)
 
@@ -231,14 +231,14 @@ def compose_scalars(
 def between_scalars(
     x: float, y: float, heading: float, to_x: float, to_y: float, to: float
 ) -> tuple[float, float, float]:
-    """:func:`between` of the poses (x, y, heading) and (to_x, to_y, to)."""
+    """Return :func:`between` of the poses (x, y, heading) and (to_x, to_y, to) as three numbers."""
     c, s, dx, dy = math.cos(heading), math.sin(heading), to_x - x, to_y - y
     return c * dx + s * dy, c * dy - s * dx, wrap_scalar(to - heading)
 
 
 @compiled
 def moved(pose: Array, twist: Array) -> Array:
-    """The pose (3,) moved by a twist in its own frame: ``pose * exp(twist)``. ``twist``: its first three components are used."""
+    """Return ``pose * exp(twist)``: the pose (3,) moved by a twist in its frame, the first 3 elements of ``twist``."""
     x, y, turned = exp_scalars(twist[0], twist[1], twist[2])
     c, s = math.cos(pose[2]), math.sin(pose[2])
     return np.array((pose[0] + c * x - s * y, pose[1] + s * x + c * y, wrap_scalar(pose[2] + turned)))
@@ -246,20 +246,20 @@ def moved(pose: Array, twist: Array) -> Array:
 
 @compiled
 def twist_to(pose: Array, target: Array) -> Array:
-    """The twist (3,) that moves ``pose`` (3,) to ``target`` (3,), in the frame of ``pose``. The inverse of :func:`moved`."""
+    """Return the twist (3,), in the frame of ``pose`` (3,), that moves ``pose`` to ``target`` (3,)."""
     x, y, turned = between_scalars(pose[0], pose[1], pose[2], target[0], target[1], target[2])
     return np.array(log_scalars(x, y, turned))
 
 
 @compiled
 def compose_one(a: Array, b: Array) -> Array:
-    """:func:`compose` of two poses (3,)."""
+    """Return :func:`compose` of two poses (3,)."""
     return np.array(compose_scalars(a[0], a[1], a[2], b[0], b[1], b[2]))
 
 
 @compiled
 def between_one(a: Array, b: Array) -> Array:
-    """:func:`between` of two poses (3,)."""
+    """Return :func:`between` of two poses (3,)."""
     return np.array(between_scalars(a[0], a[1], a[2], b[0], b[1], b[2]))
 
 
@@ -274,7 +274,7 @@ def right_jacobian(xi: Array) -> Array:
 
 @compiled
 def inverse_right_jacobian(xi: Array) -> Array:
-    """The inverse (3, 3) of :func:`right_jacobian`."""
+    """Return the inverse (3, 3) of :func:`right_jacobian`."""
     j = right_jacobian(xi)
     p, q, u, v = j[0, 0], j[0, 1], j[0, 2], j[1, 2]
     scale = 1.0 / (p * p + q * q)
@@ -284,8 +284,8 @@ def inverse_right_jacobian(xi: Array) -> Array:
 
 @compiled
 def body_to_world_one(pose: Array, covariance: Array) -> Array:
-    """:func:`body_to_world` of one pose (3,) and of the first three components of a covariance (S, S). Elements below
-    the diagonal are ignored, so the result (3, 3) is exactly symmetric."""
+    """Return the covariance (3, 3) of (x, y, heading) in the world, from the body-frame covariance of one pose (3,).
+    ``covariance`` (S, S): its first three components are used. Elements below its diagonal are ignored."""
     c, s = math.cos(pose[2]), math.sin(pose[2])
     out = np.empty((3, 3))
     a, b, e = covariance[0, 0], covariance[0, 1], covariance[1, 1]
@@ -299,8 +299,8 @@ def body_to_world_one(pose: Array, covariance: Array) -> Array:
 
 @compiled(error_model="numpy", fastmath={"arcp", "contract", "reassoc"})
 def all_moved(poses: Array, delta: Array, twists: Array) -> Array:
-    """Move each of N poses (N, 3) by the common motion ``delta`` (3,) and then by its own twist (N, 3):
-    ``poses * delta * exp(twists)``."""
+    """Return ``poses * delta * exp(twists)`` (N, 3): N poses, each moved by the common motion ``delta`` (3,) and then
+    by its own twist (N, 3)."""
     out, cd, sd = np.empty_like(poses), math.cos(delta[2]), math.sin(delta[2])
     for n in range(len(poses)):
         c, s = math.cos(poses[n, 2]), math.sin(poses[n, 2])
@@ -314,7 +314,7 @@ def all_moved(poses: Array, delta: Array, twists: Array) -> Array:
 
 @compiled(error_model="numpy", fastmath={"arcp", "contract", "reassoc"})
 def twists_to(pose: Array, targets: Array) -> Array:
-    """The twists (N, 3) that move ``pose`` (3,) to each of ``targets`` (N, 3), in the frame of ``pose``."""
+    """Return the twists (N, 3) that move ``pose`` (3,) to each of ``targets`` (N, 3), in the frame of ``pose``."""
     out, c, s = np.empty_like(targets), math.cos(pose[2]), math.sin(pose[2])
     for n in range(len(targets)):
         dx, dy = targets[n, 0] - pose[0], targets[n, 1] - pose[1]

@@ -21,7 +21,7 @@ class SightingFactor(Protocol):
         """Return the residual (K, g), and its Jacobian (K, g, d) with respect to each value. All are whitened."""
 
     def weight(self, squared: Array) -> Array:
-        """The robust weights of ``squared`` norms of whitened residuals."""
+        """Return the robust weights (K,) for ``squared`` (K,), the squared norms of whitened residuals."""
 
     def dof(self) -> int:
         """Return the number of measured coordinates."""
@@ -54,7 +54,8 @@ class Marginalized:
     covariances: tuple[Array | None, ...]
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Return the residual (K, g), and its Jacobian (K, g, 3) with respect to the pose. Both are whitened."""
+        """Return the whitened residual (K, g) and a list of its Jacobian (K, g, 3). ``values``: a list of the pose
+        (3,)."""
         residual, (by_pose, *by_values) = self.factor.whitened([values[0], *self.values])
         noise = np.eye(residual.shape[1])
         for block, covariance in zip(by_values, self.covariances, strict=True):
@@ -66,17 +67,17 @@ class Marginalized:
         return np.einsum("kij,kj->ki", whitener, residual), [whitener @ by_pose]
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """The whitened residual (K g,) with robust weights, and its Jacobian (K g, 3) with respect to the pose."""
+        """Return the whitened residual (K g,) with robust weights, and a list of its Jacobian (K g, 3) by the pose."""
         residual, (by_pose,) = self.whitened(values)
         weight = np.sqrt(self.weight(np.einsum("ki,ki->k", residual, residual)))
         return (weight[:, None] * residual).ravel(), [(weight[:, None, None] * by_pose).reshape(-1, 3)]
 
     def weight(self, squared: Array) -> Array:
-        """The robust weights of ``squared`` norms of whitened residuals."""
+        """Return the robust weights (K,) for ``squared`` (K,), the squared norms of whitened residuals."""
         return self.factor.weight(squared)
 
     def cost(self, values: Sequence[Array]) -> float:
-        """Return half the weighted sum of squared residuals."""
+        """Return half the weighted sum of squared residuals. ``values``: a list of the pose (3,)."""
         residual, _ = self.whitened(values)
         squared = np.einsum("ki,ki->k", residual, residual)
         return float(0.5 * np.sum(self.weight(squared) * squared))

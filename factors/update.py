@@ -28,7 +28,7 @@ class Correction:
     """The correction of a Gaussian error state (S,) by an observation.
 
     ``delta`` (S,): the correction of the error state. ``covariance`` (S, S): the covariance after the correction.
-    ``residual`` (K, g): whitened residuals of K sightings at the prediction, predicted minus measured.
+    ``residual`` (K, g): whitened residuals of K measured objects at the prediction, predicted minus measured.
     ``nis``: the normalised innovation squared. ``dof``: its degrees of freedom.
 
     The last three fields are for likelihoods without residuals, such as the likelihood of RFID reads. ``excess_nll``:
@@ -55,7 +55,7 @@ def update_state(
     converged: float = CONVERGED,
     common: int = 0,
 ) -> Correction:
-    """Correct a Gaussian by K sightings, with a robust, iterated Kalman update.
+    """Correct a Gaussian by K sightings (measured objects with g coordinates), with a robust, iterated Kalman update.
 
     ``linearize(delta)``: returns the whitened residuals (K, g) at the correction ``delta`` (S,), and their Jacobian (K,
     g, D) by the first D components of the error state.
@@ -132,7 +132,7 @@ def _iterated(
 
 
 def _informed(prior: Array) -> _Solver:
-    """Make a solver of linearised updates in information form. ``prior`` (S, S): the inverse covariance of the prediction."""
+    """Return a solver of linearised updates in information form. ``prior`` (S, S): the predicted inverse covariance."""
 
     def solve(blocks: Array, residual: Array, weight: Array, at: Array) -> tuple[Array, Array]:
         information = prior.copy()
@@ -162,9 +162,9 @@ def _rooted(root: Array) -> _Solver:
 
 @compiled(error_model="numpy")
 def inform(residual: Array, jacobian: Array, columns: Integers, weights: Array, at: Array, total: Array) -> Array:
-    """Add the information of K residuals to ``total`` (S, S), and return their information vector (D,).
+    """Add the information of K sightings to ``total`` (S, S), and return their information vector (D,).
 
-    ``residual`` (K, g), ``jacobian`` (K, g, D): linearised at the correction ``at`` (S,).
+    ``residual`` (K, g), ``jacobian`` (K, g, D): whitened, linearised at the correction ``at`` (S,).
     ``columns`` (D,): the components of the error state that the columns of the Jacobian belong to.
     ``weights`` (K,): weights of the sightings.
 
@@ -191,10 +191,10 @@ def inform(residual: Array, jacobian: Array, columns: Integers, weights: Array, 
 def corrected(
     prior: Array, residual: Array, jacobian: Array, columns: Integers, weights: Array, at: Array
 ) -> tuple[Array, Array, Array]:
-    """One Kalman update in information form.
+    """Run one Kalman update in information form.
 
-    ``prior`` (S, S): the information of the prediction. The other arguments are those of :func:`inform`. Returns the
-    correction (S,), the covariance (S, S) after it, and the information vector (D,) of the residuals. Raises
+    ``prior`` (S, S): the inverse covariance of the prediction. The other arguments are those of :func:`inform`. Returns
+    the correction (S,), the covariance (S, S) after it, and the information vector (D,) of the residuals. Raises
     LinAlgError if the total information is not positive definite.
     """
     total = prior.copy()
@@ -208,9 +208,9 @@ def corrected(
 
 @compiled(error_model="numpy")
 def normalised(residual: Array, jacobian: Array, columns: Integers, covariance: Array) -> Array:
-    """The normalised innovation squared (K,) of each of K sightings. ``residual`` (K, g): the whitened residuals.
-    ``jacobian`` (K, g, D): their Jacobian by the components ``columns`` (D,) of the error state. ``covariance`` (S, S):
-    the covariance of the error state."""
+    """Return the normalised innovation squared (K,) of each of K sightings. ``residual`` (K, g): the whitened
+    residuals. ``jacobian`` (K, g, D): their Jacobian by the components ``columns`` (D,) of the error state.
+    ``covariance`` (S, S): the covariance of the error state."""
     size, wide = residual.shape[1], len(columns)
     out, left, whitened = np.zeros(len(residual)), np.empty((size, size)), np.empty(size)
     for k in range(len(residual)):

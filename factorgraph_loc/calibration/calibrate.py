@@ -19,7 +19,7 @@ from factorgraph_loc.text import Notice, listed, notice
 
 @dataclass(frozen=True)
 class Calibration:
-    """Result of a calibration.
+    """The result of a calibration of a rig (the sensors of a robot, with mounting, constants and noise).
 
     ``logs``: names of the logs. ``input_rig``: the rig before the calibration.
     ``rig``: the learnt rig, or ``input_rig`` if the learnt rig is refused. ``refused``: the reason of the refusal, ""
@@ -44,10 +44,11 @@ def calibrate(
     *,
     grids: Path | None = None,
 ) -> Calibration:
-    """Calibrate a rig from ``logs``. If no log has a reference, smoothing and learning alternate.
+    """Learn the constants of a rig (the sensors of a robot) from ``logs``, and test the learnt rig on held-out logs. If
+    no log has a reference trajectory, smoothing and learning alternate, without a test.
 
-    ``run``: runs an estimator on a log. ``rig``: its values are the means of the priors; None for the rig of the first
-    log. ``progress``: called with the number of steps done and the number of all steps.
+    ``run(log, estimator)``: runs the named estimator on a log. ``rig``: its values are the means of the priors. None
+    means the rig of the first log. ``progress``: called with the number of steps done and the number of all steps.
     ``grids``: path prefix of the files of learnt detection grids, required for logs with tag reads.
 
     Raises InputError if only some logs have a reference, or if a log is too short, lacks odometry, or has other
@@ -95,9 +96,9 @@ def _map_warnings(trials: Sequence[Trial]) -> list[Notice]:
 
 
 def check(logs: Sequence[Log], *, blind: bool = False) -> None:
-    """Raise InputError if logs cannot be calibrated together.
+    """Raise InputError if ``logs`` cannot be calibrated together.
 
-    The logs must have odometry, measurements, equal sensors, and, unless ``blind`` is set, a reference.
+    The logs must have odometry, measurements, equal sensors and, unless ``blind`` is True, a reference trajectory.
     """
     if not logs:
         raise InputError("there is no log to calibrate from")
@@ -119,7 +120,7 @@ def check(logs: Sequence[Log], *, blind: bool = False) -> None:
 
 
 def _check_alike(first: Log, log: Log) -> None:
-    """Raise InputError if two logs differ in their sensors, in the kinds of their streams, or in the headings of the reference."""
+    """Raise InputError if two logs differ in sensors, in the kinds of streams, or in having reference headings."""
     for sensor in senses(first.rig):
         for one_log, other_log in ((first, log), (log, first)):
             if _has(one_log, sensor) and not _has(other_log, sensor):

@@ -32,7 +32,7 @@ Scores = Mapping[str, Any]
 
 
 class Scored(Protocol):
-    """The ``result`` of a run, and its ``scores``, which :func:`factorgraph_loc.evaluation.metrics.score` computes."""
+    """The ``result`` of a run, and its ``scores`` by :func:`factorgraph_loc.evaluation.metrics.score`."""
 
     @property
     def result(self) -> RunResult: ...
@@ -46,9 +46,10 @@ Run = Callable[[Log, str], Scored]
 
 @dataclass(frozen=True)
 class Trial:
-    """The runs of an estimator on one held-out section of a log.
+    """The runs of an estimator on one held-out section of a log, with the input rig and with the learnt rig.
 
-    ``log``: name of the log. ``scores``: the scores of the run by rig (:data:`RIGS`), None if the run failed.
+    ``log``: name of the log. ``scores``: the scores of the run with each rig, by the names in :data:`RIGS`. None if the
+    run failed.
     ``doubted``: probabilities that landmarks or tags have moved or are dead, as {kind: {name: probability}}, from the
     run with the learnt rig.
     """
@@ -60,7 +61,7 @@ class Trial:
 
 
 def folds_of(logs: Sequence[Log]) -> list[tuple[list[Log], list[Log]]]:
-    """Return the folds of a cross-validation: for each fold, the logs to learn from and the held-out sections.
+    """Return the folds of a cross-validation, as pairs of the logs to learn from and the held-out sections.
 
     Each recording is held out once. The two halves of a single recording count as two recordings.
     """
@@ -79,9 +80,11 @@ def folds_of(logs: Sequence[Log]) -> list[tuple[list[Log], list[Log]]]:
 
 
 def trials_of(tests: Sequence[Log], initial: Rig, learnt: Rig, run: Run) -> list[Trial]:
-    """Run all :data:`ESTIMATORS` on the held-out sections ``tests``, with the rigs ``initial`` and ``learnt``.
+    """Run all :data:`ESTIMATORS` on the held-out sections ``tests``, with the rigs ``initial`` and ``learnt``. Returns
+    one trial for each section and estimator.
 
-    ``run``: runs an estimator on a log. The rig ``initial`` is omitted if it lacks settings that its sensors need.
+    ``run(log, estimator)``: runs the named estimator on a log. The rig ``initial`` is omitted if it lacks settings that
+    its sensors need.
     """
     complete = all(calibrator.is_complete(initial) for calibrator in calibrators(initial).values())
     rigs = {"learnt": learnt} | ({"input": initial} if complete else {})
@@ -99,7 +102,7 @@ def trials_of(tests: Sequence[Log], initial: Rig, learnt: Rig, run: Run) -> list
 
 
 def pooled(trials: Sequence[Trial], rig: str, key: str) -> float:
-    """Return a score pooled over held-out sections, weighted by their numbers of poses: root mean square, or mean for ANEES.
+    """Return one score for all held-out sections, weighted by numbers of poses: root mean square, or mean for ANEES.
 
     ``rig``: one of :data:`RIGS`. ``key``: name of the score, such as "final.position_rmse". Only sections with a score
     of both rigs are used, if there are any. Returns NaN if no section has the score.
@@ -122,15 +125,16 @@ def _is_known(trial: Trial, key: str) -> bool:
 
 
 def growth(trials: Sequence[Trial]) -> float:
-    """Return the ratio of the position errors with the learnt rig to those with the input rig.
+    """Return the ratio of the position RMSE on held-out sections with the learnt rig to that with the input rig.
 
-    It is the geometric mean over the estimators and over causal and final trajectories. Returns NaN if it is unknown.
+    It is the geometric mean over the estimators and over causal and final trajectories. Returns NaN without scores of
+    both.
     """
     return _ratio(trials, lambda mine, rig, kind: pooled(mine, rig, f"{kind}.position_rmse"))
 
 
 def _ratio(trials: Sequence[Trial], loss: Callable[[Sequence[Trial], str, str], float]) -> float:
-    """Return the ratio of a loss with the learnt rig to that with the input rig. Return NaN if no trial has scores of both.
+    """Return the ratio of a loss with the learnt rig to that with the input rig. Returns NaN without scores of both.
 
     ``loss``: a function (trials, rig, kind) that returns a number, where kind is "causal" or "final". The ratio is the
     geometric mean over the estimators and over causal and final trajectories.
@@ -145,14 +149,14 @@ def _ratio(trials: Sequence[Trial], loss: Callable[[Sequence[Trial], str, str], 
 
 
 def _anees_factor(trials: Sequence[Trial], rig: str, kind: str) -> float:
-    """Return the factor (at least 1) between the pooled ANEES of a rig and its ideal value. ``kind``: "causal" or "final"."""
+    """Return the factor (at least 1) between the pooled ANEES of a rig and its ideal. ``kind``: "causal" or "final"."""
     dimensions = 3.0 if math.isfinite(pooled(trials, rig, f"{kind}.heading_rmse")) else 2.0
     factor = max(pooled(trials, rig, f"{kind}.anees") / dimensions, 1e-9)
     return max(factor, 1.0 / factor)
 
 
 def refusal(trials: Sequence[Trial]) -> str:
-    """Return the reason to refuse the learnt rig, or "" if there is none."""
+    """Return the reason to refuse the learnt rig, such as larger errors on held-out logs, or "" if there is none."""
     failed = [t for t in trials if t.scores["learnt"] is None and t.scores["input"] is not None]
     if failed:
         return f"the {failed[0].estimator} fails on {failed[0].log} with the rig that is learnt from the other data"
@@ -169,7 +173,7 @@ def refusal(trials: Sequence[Trial]) -> str:
 
 
 def _section(log: Log, begin: float, end: float) -> Log | None:
-    """Cut a section from a log. ``begin``, ``end``: fractions of the time span that odometry and reference have in common.
+    """Return a section of a log. ``begin``, ``end``: fractions of the time that odometry and reference share.
 
     Returns None if the section has no measurements, or lacks odometry or the reference.
     """
@@ -182,7 +186,7 @@ def _section(log: Log, begin: float, end: float) -> Log | None:
 
 
 def _sections(log: Log) -> list[Log]:
-    """Return sections of a log, evenly spread over it, that have at least :data:`FEWEST_POSES` poses of the reference."""
+    """Return evenly spread sections of a log, with at least :data:`FEWEST_POSES` poses of the reference each."""
     first, last = overlap(log)
     edges = np.linspace(0.0, 1.0, min(MOST, max(1, round((last - first) / LONGEST))) + 1)
     out = []

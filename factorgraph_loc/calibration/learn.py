@@ -33,10 +33,10 @@ TOO_VAGUE = 1.0  # m; a smoothed trajectory with a larger median standard deviat
 
 @dataclass(frozen=True)
 class Knowledge:
-    """A learnt ``rig``, and the results of its ``sensors`` by name.
+    """A learnt ``rig``, and the learnt constants, warnings and figures of its ``sensors``, by the name of the sensor.
 
-    ``turns``: for logs without a reference, the largest change of a constant in each turn of smoothing and learning, in
-    standard errors. Empty for logs with a reference.
+    ``turns``: for logs without a reference, smoothing and learning alternate. For each iteration, the largest change of
+    a constant in standard errors. Empty for logs with a reference.
     """
 
     rig: Rig
@@ -50,7 +50,7 @@ class Knowledge:
 
     @property
     def notes(self) -> tuple[Notice, ...]:
-        """The warnings of all sensors, and one if the alternation of smoothing and learning has not converged."""
+        """The warnings of all sensors, and one if the iterations of smoothing and learning have not converged."""
         notes = [note for sensor in self.sensors.values() for note in sensor.notes]
         if self.turns and self.turns[-1] >= SETTLED:
             change = "The last of {turns} turns still changed a value by {change:.1f} standard errors: "
@@ -80,9 +80,10 @@ def learn(
 ) -> Knowledge:
     """Learn a rig from logs with known trajectories. The constants of each sensor are learnt separately.
 
-    ``traced``: logs with trajectories. ``rig``: initial values. ``first``: the rig before smoothing and learning began to
-    alternate, None for ``rig``. ``grids``: path and name prefix of files of detection grids that may be written. ``like``: a
-    result from more logs; the sensor models selected there are used again. Raises InputError if a log is too short.
+    ``traced``: logs with trajectories. ``rig``: initial values. ``first``: the rig before the first iteration of
+    smoothing and learning, None for ``rig``. ``grids``: path and name prefix of files of detection grids that may be
+    written. ``like``: a result from more logs. The sensor models selected there are used again. Raises InputError if a
+    log is too short.
     """
     traced = [replace(trace, log=replace(trace.log, rig=rig)) for trace in traced]
     sensors, learnt = {}, rig
@@ -116,9 +117,9 @@ def learn_by_turns(
 ) -> Knowledge:
     """Learn a rig from ``logs`` without reference trajectories: alternately smooth all logs and learn from the result.
 
-    ``start``: the rig of the first turn. ``smooth``: runs the smoother on a log. ``grids``: path and name prefix of
-    files of detection grids that may be written. ``progress``: called with the number of smoothed logs so far and its
-    maximum. Raises InputError if a log contains too little information.
+    ``start``: the rig of the first iteration. ``smooth``: runs the smoother on a log. ``grids``: path and name prefix
+    of files of detection grids that may be written. ``progress``: called with the number of smoothed logs so far and
+    its maximum. Raises InputError if a log contains too little information.
     """
     rig, turns, fitted = start, list[float](), dict[tuple[str, str], float]()
     while True:
@@ -145,7 +146,7 @@ def learn_by_turns(
 def _smoothed(log: Log, smooth: Smooth) -> Traced:
     """Smooth a log, and return it with the smoothed trajectory as reference.
 
-    Raises InputError if the robot is not localized, or the trajectory is less certain than :data:`TOO_VAGUE`.
+    Raises InputError if the robot is not localized, or the median position sigma exceeds :data:`TOO_VAGUE`.
     """
     result = smooth(log)
     final = result.final
@@ -164,6 +165,6 @@ def _smoothed(log: Log, smooth: Smooth) -> Traced:
 
 
 def _change(constant: FittedConstant, fitted: Mapping[tuple[str, str], float]) -> float:
-    """Return the change of a constant in a turn, in standard errors. ``fitted``: the values of the previous turn."""
+    """Return the change of a constant in an iteration, in standard errors. ``fitted``: the previous values."""
     change = abs(constant.fitted - fitted.get((constant.sensor, constant.name), constant.initial))
     return change / constant.error if change > 0.0 else 0.0

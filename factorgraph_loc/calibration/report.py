@@ -28,9 +28,11 @@ VIEW = 5.0  # standard deviations; larger residuals are drawn at the edge
 
 
 def constants_table(constants: Sequence[FittedConstant], logs: Sequence[str] = ()) -> Rows:
-    """Return a table of the constants: initial value, learnt value, standard deviation of the learnt value and of the prior.
+    """Return a table (header, rows) of constants: initial and learnt value, its standard deviation, and that of the
+    prior.
 
-    ``logs``: names of the logs. If there are any, the table also has the values that are learnt from each log alone.
+    ``logs``: names of the logs. If there are any, the table also has the values that are learnt from each log
+    separately.
     """
     header = ("constant", "input rig", "learnt", "standard deviation", "prior", "", *logs)
     rows = []
@@ -42,9 +44,9 @@ def constants_table(constants: Sequence[FittedConstant], logs: Sequence[str] = (
 
 
 def accuracy_table(calibration: Calibration) -> Rows:
-    """Return a table of errors with the input rig and with a learnt rig, on each held-out log and over all logs.
+    """Return a table (header, rows) of errors with the input rig and a learnt rig, on each held-out log and on all.
 
-    For each held-out log, the rig is learnt from the other data.
+    For each held-out log, the rig is learnt from the other logs.
     """
     header = ("held-out log", "estimator", "rig", *(f"{kind} {name}" for kind in KINDS for name in FIGURES))
     rows = []
@@ -59,7 +61,7 @@ def accuracy_table(calibration: Calibration) -> Rows:
 
 
 def summary(calibration: Calibration) -> list[str]:
-    """Return the result as about ten lines: changed and undetermined constants, correlations, and errors on held-out logs."""
+    """Return about ten lines of text: changed and undetermined constants, correlations, and errors on held-out logs."""
     constants = calibration.knowledge.constants
     clear = [c for c in constants if c.is_determined and abs(c.fitted - c.initial) > CLEAR * c.error]
     same = [_name(c) for c in constants if c.is_determined and c not in clear]
@@ -161,7 +163,7 @@ def _tables(figures: Mapping[str, Any]) -> list[Part]:
 
 
 def _residuals_figure(logs: Sequence[Residuals]) -> Picture:
-    """Draw the residuals of a sensor: their distribution, and their size over distance and time, a row of panels per column."""
+    """Draw the residuals of a sensor, a row of panels per column: distribution, and size over distance and time."""
     known = [i for i in range(len(logs[0].units)) if any(np.isfinite(log.errors[:, i]).any() for log in logs)]
     figure, axes = grid(len(known), 3, 4.0 * len(known))
     for panels, column in zip(axes, known, strict=True):
@@ -186,7 +188,7 @@ def _residuals_figure(logs: Sequence[Residuals]) -> Picture:
 
 
 def _correlations(calibration: Calibration) -> list[tuple[str, str, float]]:
-    """Return pairs of constants that are strongly correlated, with their correlation."""
+    """Return tuples (constant, other constant, correlation) of the constants that are strongly correlated."""
     known = {name: calibrator.section for name, calibrator in calibrators(calibration.rig).items()}
     return [
         (f"{known[name]}.{a}", f"{known[name]}.{b}", rho)

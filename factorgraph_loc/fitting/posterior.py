@@ -32,7 +32,7 @@ CORRELATED = 0.8  # two parameters with a larger absolute correlation are report
 
 @dataclass(frozen=True)
 class Parameter:
-    """A scalar parameter with a Gaussian prior, ``mean`` and ``sigma``, and the bounds ``low`` and ``high``."""
+    """A scalar parameter ``name`` with a Gaussian prior (``mean``, ``sigma``) and the bounds ``low`` and ``high``."""
 
     name: str
     mean: float
@@ -74,7 +74,8 @@ class Posterior:
         return {p.name: float(v) for p, v in zip(self.parameters, self.values, strict=True)}
 
     def correlations(self) -> list[tuple[str, str, float]]:
-        """Return (name, name, correlation) of all pairs with an absolute correlation above :data:`CORRELATED`."""
+        """Return tuples (name, name, correlation) of all pairs with an absolute correlation above
+        :data:`CORRELATED`."""
         matrix = self.covariance / np.outer(self.errors, self.errors)
         rows, columns = np.nonzero(np.abs(np.triu(matrix, 1)) > CORRELATED)
         names = [p.name for p in self.parameters]
@@ -87,7 +88,7 @@ class FittedConstant:
 
     ``initial``, ``fitted``: the values before and after the fit. ``error``: the standard error of the fitted value.
     ``prior``: the standard deviation of the prior, or None if there is no prior.
-    ``per_log``: the values fitted to each log alone.
+    ``per_log``: for each log, the value fitted to this log only. Empty if unknown.
     ``uncertainty``: the standard deviation of the constant between logs, or None if it is unknown.
     """
 
@@ -112,12 +113,11 @@ def maximise(
     start: Mapping[str, float] | None = None,
     covariance: Array | None = None,
 ) -> Posterior:
-    """Return the maximum a posteriori estimate of parameters.
+    """Return the maximum a posteriori estimate of parameters, with its covariance.
 
-    ``parameters``: P parameters with priors. ``likelihood``: returns the likelihood at parameter values (P,).
+    ``parameters``: P parameters with priors. ``likelihood``: returns cost and derivatives at values (P,).
     ``start``: initial values by name. The default is the mean of the prior.
-    ``covariance`` (P, P): the joint covariance of the priors. None means independent priors with the sigmas of the
-    parameters.
+    ``covariance`` (P, P): the joint covariance of the priors. None means independent priors.
     """
     mean, sigma, low, high = (
         np.array([getattr(p, name) for p in parameters], dtype=float) for name in ("mean", "sigma", "low", "high")
@@ -146,8 +146,8 @@ def independent_share(scores: Array, information: Array, precision: Array | floa
 
     ``scores`` (B, P): gradients of the log-likelihood of B time intervals. ``information`` (P, P): the Fisher
     information of all intervals. ``precision`` (P, P): the inverse covariance of the prior. The exponent is the ratio
-    of the information to the empirical covariance of the scores, which are equal for independent errors (Varin, Reid
-    and Firth, "An overview of composite likelihood methods", Statistica Sinica 21, 2011, section 2.2).
+    of the information to the empirical covariance of the scores. Both are equal for independent errors (Varin, Reid and
+    Firth, "An overview of composite likelihood methods", Statistica Sinica 21, 2011, section 2.2).
     """
     inverse = np.linalg.pinv(information + precision)
     ratio = np.trace(inverse @ information) / max(float(np.trace(inverse @ (scores.T @ scores))), 1e-12)
@@ -155,10 +155,10 @@ def independent_share(scores: Array, information: Array, precision: Array | floa
 
 
 def least_squares(whitened: Callable[[Array], Array], parameters: Sequence[Parameter], block: Integers) -> Likelihood:
-    """Make a likelihood of ``parameters`` from a function of residuals, by numerical derivatives and the soft-L1 loss.
+    """Return a likelihood for :func:`maximise` from residuals, by numerical derivatives and the soft-L1 loss.
 
     ``whitened(values)``: returns residuals (M, D) in standard deviations, for parameter values (P,). ``block`` (M,):
-    the time interval of each row of the residuals, from :func:`blocks`. Different intervals count as independent.
+    the time interval of each row of the residuals, from :func:`blocks`. Errors in different intervals are independent.
     """
     steps = STEP * np.diag([p.sigma for p in parameters])
 
@@ -175,16 +175,17 @@ def least_squares(whitened: Callable[[Array], Array], parameters: Sequence[Param
 
 
 def by_block(scores: Array, block: Integers) -> Array:
-    """Sum the rows of ``scores`` (M, P) that have equal numbers ``block`` (M,). Returns an array (B, P) with the sum of
-    the rows with number b in row b."""
+    """Return the sums (B, P) of the rows of ``scores`` (M, P) that have equal numbers ``block`` (M,). Row b of the
+    result is the sum of the rows with number b."""
     out = np.zeros((int(block.max(initial=0)) + 1, scores.shape[1]))
     np.add.at(out, block, scores)
     return out
 
 
 def blocks(times: Sequence[Array], length: float) -> Integers:
-    """Divide several logs into time intervals of ``length`` seconds, numbered consecutively. ``times``: an array of
-    times [s] for each log. Returns the interval number of each time, for all logs in one array."""
+    """Return the number of the time interval of each time in several logs, for all logs in one array. ``times``: an
+    array of times [s] for each log. ``length`` [s]: the length of the intervals. They are numbered consecutively over
+    all logs."""
     out: list[Integers] = []
     first = 0
     for t in times:
@@ -194,11 +195,11 @@ def blocks(times: Sequence[Array], length: float) -> Integers:
 
 
 def robust_sigma(values: Array) -> Array:
-    """The robust standard deviation (D,) about zero of the columns of ``values`` (M, D), from their median absolute
-    value. NaN is ignored."""
+    """Return the robust standard deviation (D,) about zero of the columns of ``values`` (M, D), from their median
+    absolute value. NaN is ignored."""
     return np.asarray(MAD_TO_SIGMA * np.nanmedian(np.abs(values), axis=0))
 
 
 def centred(parameters: Sequence[Parameter], values: Mapping[str, float]) -> list[Parameter]:
-    """Return copies of the parameters with new prior means ``values``, which are given by name."""
+    """Return copies of the parameters with new prior means. ``values``: the new mean of each parameter by name."""
     return [replace(p, mean=values[p.name]) for p in parameters]

@@ -9,8 +9,8 @@ _Z = 1.959963984540054  # a standard normal variable is between -_Z and _Z with 
 
 
 def wilson(successes: ArrayLike, count: ArrayLike) -> tuple[Array, Array]:
-    """Return the bounds (low, high) of the 95 % confidence interval of a proportion, given ``successes`` (N,) in
-    ``count`` (N,) trials.
+    """Return the lower and upper bounds, two arrays (N,), of the 95 % confidence interval of a proportion, given
+    ``successes`` (N,) in ``count`` (N,) trials.
 
     Wilson, "Probable inference, the law of succession, and statistical inference", Journal of the American Statistical
     Association 22(158), 1927.

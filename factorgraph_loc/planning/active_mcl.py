@@ -36,8 +36,9 @@ ONE_PLACE = 0.99  # weight of a mode above which the particles agree on one pose
 
 @dataclass(frozen=True)
 class ProximityReading:
-    """A reading of a proximity sensor, by which a particle filter weights its particles. ``lengths`` (D,) [m]: the
-    measured free lengths in D directions. ``found``, ``work``, ``things``: constants that every observation must have."""
+    """Free lengths around the robot from a proximity sensor, an observation that weights the particles of a filter.
+    ``lengths`` (D,) [m]: in D directions. ``found``, ``work``, ``things``: constants that every observation must
+    have."""
 
     sensor: ProximitySensor
     lengths: Array
@@ -69,7 +70,8 @@ class ActiveMcl:
         raise NotImplementedError("ActiveMCL always starts at an unknown pose")
 
     def process(self, measurement: Measurement) -> None:
-        """Process one measurement. Measurements must come in the order of time."""
+        """Process one measurement. Measurements must come in the order of time. A tick moves the particles to its time,
+        and records the estimate."""
         if measurement.is_motion:
             self._motion.add(measurement)
             return
@@ -81,13 +83,14 @@ class ActiveMcl:
             self._search.look(measurement, self._motion.state(measurement.t))
 
     def see(self, sensor: ProximitySensor, lengths: Array) -> None:
-        """Weight the particles by the free ``lengths`` (D,) [m] that a proximity sensor measured. A reading is ignored
-        before the particles have processed a measurement of another sensor."""
+        """Weight the particles by the free ``lengths`` (D,) [m] that a proximity sensor measured. The call has no
+        effect before the particles have processed a measurement of another sensor."""
         self._search.queue(ProximityReading(sensor, lengths), self._motion.state(self._t))
         self._search.advance(self._t)
 
     def estimate(self, t: float | None = None) -> PoseEstimate:
-        """Return the mode with the largest weight. The status is ``localized`` if its weight is above :data:`ONE_PLACE`."""
+        """Return the mode with the largest weight, ``localized`` if its weight is above :data:`ONE_PLACE`. ``t`` [s]:
+        the time of the estimate. None, or an earlier time, means the time of the last measurement."""
         at = self._t if t is None else max(t, self._t)
         modes = self._search.modes(at) if self._search.newest is not None else []
         if not modes:
@@ -96,8 +99,8 @@ class ActiveMcl:
         return PoseEstimate(at, modes[0].pose, modes[0].covariance, status)
 
     def belief(self, t: float | None = None) -> Belief:
-        """Return the modes and the particles. If the weight of one mode is above :data:`ONE_PLACE`, only its particles
-        are returned."""
+        """Return the modes and the particles at the time ``t`` [s], None for the time of the last measurement. If the
+        weight of one mode is above :data:`ONE_PLACE`, only its particles are returned."""
         at = self._t if t is None else max(t, self._t)
         particles = self._search.particles(at) if self._search.newest is not None else None
         if particles is None:
@@ -113,7 +116,7 @@ class ActiveMcl:
         return Learnt()
 
     def trajectory(self) -> Trajectory:
-        """Return the causal estimates at the ticks, the times at which the run recorded the pose."""
+        """Return the estimates that were recorded at the ticks, each from measurements up to its time."""
         poses = np.array([r.pose for r in self._records]).reshape(-1, 3)
         covariances = np.array([r.covariance for r in self._records]).reshape(-1, 3, 3)
         return Trajectory(np.array([r.t for r in self._records]), poses, covariances)

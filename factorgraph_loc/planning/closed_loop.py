@@ -54,10 +54,10 @@ class PlanningStep:
     """One choice of a path by a policy.
 
     ``t`` [s], ``metres`` [m]: time and driven distance. ``truth`` (3,): the true pose.
-    ``pose`` (3,), ``covariance`` (3, 3): the estimate, NaN before the first observation.
+    ``pose`` (3,), ``covariance`` (3, 3): the estimate in the world frame, NaN before the first observation.
     ``particles`` (K, 3): an equally weighted sample of the belief.
     ``candidates``: the C proposed paths as poses (S, 3) in the world frame, starting at the true pose.
-    ``values`` (C,): the policy's scores of the candidates, higher is better; empty if the policy does not compare them.
+    ``values`` (C,): the policy's scores of the candidates, higher is better. Empty if the policy does not compare them.
     ``chosen``: the poses of the chosen path, None if no path was free. ``planning_ms`` [ms]: the computing time.
     """
 
@@ -77,7 +77,7 @@ class PlanningStep:
 class ActiveRun:
     """The result of a run of one policy with one estimator in one world, simulated from a ``preset`` with a ``seed``.
 
-    ``localized``: True if the robot was localized correctly; the run then ends.
+    ``localized``: True if the robot was localized correctly. The run ends then.
     ``metres`` [m], ``seconds`` [s]: distance and time at the end of the run.
     ``error_position`` [m], ``error_heading`` [rad]: the errors of the estimate at the end.
     ``claimed_wrong``: True if the estimate ever had the status ``localized`` with an error above :data:`WRONG` times
@@ -108,7 +108,7 @@ class ActiveRun:
 def run_active(
     simulation: SimulationSettings, policy: str, estimator: str, seed: int, settings: ActiveSettings | None = None
 ) -> ActiveRun:
-    """Simulate a robot that drives from an unknown start until it is localized or gives up.
+    """Simulate a robot that drives from an unknown start until it is localized, or too far, or for too long.
 
     ``policy``, ``estimator``: names. Runs with the same ``seed`` have the same world, start and noise sequences. Raises
     InputError for an unknown name, a start that is not free, or a sensor that is faster than the robot's control.
@@ -136,7 +136,8 @@ def run_active(
 
 
 class _ClosedLoop:
-    """One run: a loop in which a policy chooses a path, the robot drives it, and measurements update the estimate."""
+    """A simulated run: a policy chooses a path, the robot drives it, and measurements update the estimate, in a
+    loop."""
 
     def __init__(
         self, simulation: SimulationSettings, policy: str, estimator: str, seed: int, settings: ActiveSettings
@@ -331,8 +332,8 @@ def _main_modes(belief: Belief) -> tuple[Mode, ...]:
 
 
 def _sampled(belief: Belief, space: FreeSpace, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Return particles (M, 3) and weights (M,) of a belief. Without particles they are drawn from the modes of the
-    belief, and without modes from free space."""
+    """Return particles (M, 3) and weights (M,) of a belief. If the belief has no particles, they are drawn from its
+    modes. If it has no modes either, they are drawn from free space."""
     if belief.particles is not None and belief.weights is not None and len(belief.particles):
         return belief.particles, belief.weights
     even = np.full(SAMPLES, 1.0 / SAMPLES)

@@ -59,7 +59,7 @@ class Sensors:
     """The sensor models of a robot. They predict the information of measurements along a path.
 
     ``odometry``: the noise of the motion. ``forecasts``: predict the measurements of each sensor that observes objects
-    in the map. ``metres_per_radian``: the distance [m] that the robot drives in the time of a turn by one radian.
+    in the map. ``metres_per_radian`` [m]: the distance driven in the time that a turn by one radian takes.
     """
 
     odometry: OdometryModel
@@ -81,7 +81,8 @@ class Sensors:
         only: Collection[str],
     ) -> Sensors:
         """Return the sensor models of a rig. ``only``: the names of the sensors that are used. ``settings``: the
-        settings of the simulation, with the rates of sensors. ``speed`` [m/s], ``turn_rate`` [rad/s]: of the robot."""
+        settings of the simulation, which have the rates of sensors. ``speed`` [m/s], ``turn_rate`` [rad/s]: of the
+        robot."""
         made = [
             forecast(world, rig.alone(name), speed, settings)
             for name, forecast in functions("forecast", rig)
@@ -139,10 +140,11 @@ def expected_gain(
 ) -> Array:
     """Return the expected reduction of entropy (C,) [nats] by the measurements on each of C ``paths``.
 
-    ``particles`` (M, 3), ``weights`` (M,): the belief, in the world frame. ``space``: a particle stops and measures
-    nothing where its path leads into a wall. ``places`` (M,): the index of each particle's mode. If given, the entropy
-    is that of this index, otherwise that of the pose at the end of the path. ``noise``: of the odometry, None for no
-    noise. ``samples``: the number of particles. ``scans``: the number of particles at which measurements are simulated.
+    ``sensors``: models of the sensors. ``particles`` (M, 3), ``weights`` (M,): the belief, in the world frame.
+    ``space``: free space. A particle stops and measures nothing where its path leads into a wall. None means no walls.
+    ``places`` (M,): the index of each particle's mode. If given, the entropy is that of this index. Otherwise it is
+    that of the pose at the end of the path. ``noise``: of the odometry, None for no noise. ``samples``: the number of
+    particles to use. ``scans``: the number of these particles at which measurements are simulated.
     """
     if not paths:
         return np.empty(0)
@@ -184,9 +186,9 @@ def expected_gain(
 
 
 def _entropies(poses: Array, index: Places, weights: Array32, dims: int, *, several: bool) -> Array:
-    """Return J entropies of particles. ``poses`` (S, M, 3): the particles at S stations. ``index`` (J,): the station of
-    each entropy. ``weights`` (J, M): the particles' weights for each entropy. ``dims``: the number of leading
-    coordinates that are considered. ``several``: True to use a histogram, False to use a Gaussian."""
+    """Return the entropies (J,) [nats] of particles. ``poses`` (S, M, 3): the particles at S stations. ``index`` (J,):
+    the station of each entropy. ``weights`` (J, M): the particles' weights for each entropy. ``dims``: the number of
+    leading coordinates that are considered. ``several``: True to use a histogram, False to use a Gaussian."""
     if several:
         out = np.empty(len(index))
         particle_kernels.cell_entropies(poses, index, weights, CELL, dims, out)
@@ -197,10 +199,10 @@ def _entropies(poses: Array, index: Places, weights: Array32, dims: int, *, seve
 
 
 def _stations(passed: Array) -> Places:
-    """Return the indices of stations among the poses of a path: the start, the poses of predicted measurements, and the end.
+    """Return the indices of stations among the poses of a path: the start, the poses of measurements, and the end.
 
-    ``passed`` (S,) [m]: the distance up to each pose of the path. The path is divided into equal parts, and the measurements
-    of each part are predicted in its middle.
+    ``passed`` (S,) [m]: the distance up to each pose of the path. The path is divided into equal parts, and the
+    measurements of each part are predicted in its middle.
     """
     count = min(max(1, round(passed[-1] / STATION_DISTANCE)), MOST_STATIONS)
     middles = (np.arange(count) + 0.5) * passed[-1] / count
@@ -222,8 +224,8 @@ def _sigmas(path: Path, steps: Places, noise: OdometryModel) -> Array:
 def expected_covariance(mean: Array, covariance: Array, path: Path, sensors: Sensors) -> Array:
     """Return the expected covariance (3, 3) of x, y and heading in the world frame at the end of a path.
 
-    ``mean`` (3,), ``covariance`` (3, 3): the belief at the start of the path. The sensors measure at each pose of the
-    path except the first.
+    ``mean`` (3,), ``covariance`` (3, 3): the belief at the start of the path, also in the world frame. The sensors
+    measure at each pose of the path except the first.
     """
     body = se2.world_to_body(mean, covariance)
     poses = se2.compose(mean, path.poses)
@@ -244,10 +246,11 @@ def expected_covariance(mean: Array, covariance: Array, path: Path, sensors: Sen
 
 
 def fisher_gain(mean: Array, covariance: Array, paths: Sequence[Path], sensors: Sensors) -> Array:
-    """Return the expected reduction of entropy (C,) [nats] of a Gaussian belief on each of C paths.
+    """Return the expected reduction of entropy (C,) [nats] of a Gaussian belief on each of C paths. It is negative if
+    the noise of the motion exceeds the gain.
 
-    ``mean`` (3,), ``covariance`` (3, 3): the belief. Standard deviations below
-    :data:`~factorgraph_loc.planning.information.FINEST` are not counted as a gain.
+    ``mean`` (3,), ``covariance`` (3, 3): the belief, with the covariance of (x, y, heading) in the world. Standard
+    deviations below :data:`~factorgraph_loc.planning.information.FINEST` are not counted as a gain.
     """
     fine = np.diag(FINEST**2)
     entropies = [gaussian_entropy(expected_covariance(mean, covariance, path, sensors) + fine) for path in paths]

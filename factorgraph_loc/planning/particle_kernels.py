@@ -17,9 +17,9 @@ def station_poses(
 
     ``particles`` (M, 3): the poses at the start. ``along`` (P, 3): the poses of the path, relative to the start.
     ``steps`` (S,): the indices of the stations among the poses of the path.
-    ``last`` (M,): the index of the last pose that each particle reaches; the particle stays there.
+    ``last`` (M,): the index of the last pose that each particle reaches. The particle stays there.
     ``sigmas`` (S, 3): standard deviations of the motion to each station, in the robot frame. ``normals`` (S, M, 3):
-    standard normal random numbers for the motion. ``out`` (S, M, 3): receives the poses.
+    standard normal random numbers for the motion. ``out`` (S, M, 3): output, the poses.
     """
     count = len(particles)
     errors = np.zeros((count, 3))

@@ -28,8 +28,9 @@ SHORT = 0.5  # relative length of the short straight paths
 class Path:
     """A path of a robot.
 
-    ``poses`` (S, 3): in the frame of the start pose, at intervals of about :data:`STEP`. The first is the start pose, the last is
-    the end. A turn in place is an additional pose at the same position. ``kind``: how the path was proposed, such as "arc".
+    ``poses`` (S, 3): in the frame of the start pose, at intervals of about :data:`STEP`. The first is the start pose,
+    the last is the end. A turn in place is an additional pose at the same position. ``kind``: how the path was
+    proposed: "arc" (also a straight path), "turn", "waypoint" (through free space to a distant place) or "patrol".
     """
 
     poses: Array
@@ -52,9 +53,9 @@ class Path:
         return float(self.metres[-1])
 
     def passed(self, metres_per_radian: float) -> Array:
-        """Return the distance (S,) [m] up to each pose. Turns count as the distance that the robot drives in the same time.
+        """Return the distance (S,) [m] up to each pose. A turn counts as the distance driven in the same time.
 
-        ``metres_per_radian``: the distance that the robot drives in the time of a turn by one radian.
+        ``metres_per_radian`` [m]: the distance that the robot drives in the time of a turn by one radian.
         """
         steps = np.maximum(np.diff(self.metres), np.diff(self.turned) * metres_per_radian)
         return np.concatenate((np.zeros(1), np.cumsum(steps)))
@@ -103,8 +104,8 @@ def waypoint_paths(
 
     ``pose`` (3,), ``targets`` (K, 2) [m]: start and targets in the world frame. The robot turns in place at the start
     and at corners. A start that is too close to a wall is replaced by the nearest free cell. Targets outside of free
-    space, and those in the cell of the robot, are left out. ``nearest``: if given, only the paths to this number of
-    nearest targets are returned. ``beyond``, ``within`` [m]: only targets at distances between these values are used.
+    space, and those in the cell of the robot, are left out. ``nearest``: the largest number of paths, to the nearest
+    targets. ``beyond``, ``within`` [m]: only targets at distances between these values are used.
     """
     start = _nearest_cell(space, pose[:2])
     ends = space.cells(np.asarray(targets, dtype=float).reshape(-1, 2))
@@ -121,10 +122,10 @@ def waypoint_paths(
 
 
 def waypoints(space: FreeSpace, count: int) -> Array:
-    """Return at most ``count`` places (K, 2) [m] that are spread over free space.
+    """Return at most ``count`` positions (K, 2) [m] that are distributed over free space.
 
-    The first place is farthest from walls. Each further place is farthest from the previous ones (farthest-point
-    sampling: Gonzalez, Theoretical Computer Science 38, 1985).
+    The first is farthest from walls. Each further position is farthest from the previous ones (farthest-point sampling:
+    Gonzalez, Theoretical Computer Science 38, 1985).
     """
     i, j = np.nonzero(space.index >= 0)
     distance = np.empty(len(space.centres))
@@ -152,7 +153,7 @@ def free_steps(space: FreeSpace, poses: Array, paths: Sequence[Path], between: i
 
 
 def arc(turn: float, curvature: float, length: float) -> Path:
-    """Return the path of a turn in place by ``turn`` [rad], followed by an arc of ``length`` [m] with ``curvature`` [rad/m]."""
+    """Return a path: a turn in place by ``turn`` [rad], then an arc of ``length`` [m] with ``curvature`` [rad/m]."""
     count = max(1, math.ceil(length / STEP - 1e-9))
     driven = np.minimum(STEP * np.arange(count + 1), length)
     poses = se2.exp(np.column_stack((driven, np.zeros(len(driven)), curvature * driven)))

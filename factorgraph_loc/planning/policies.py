@@ -40,11 +40,12 @@ NEAR = 3  # number of nearest tags whose mean distance is compared
 
 @dataclass(frozen=True)
 class Situation:
-    """The input of a policy.
+    """The input of a policy, the function that chooses the next path of a robot with an uncertain pose.
 
-    ``particles`` (M, 3), ``weights`` (M,): the belief. ``modes``: its significant modes. ``sensors``: models of the sensors.
-    ``space``: the free space between walls. ``candidates``: C paths. ``free`` (C,) [m]: the length of each path that is free of
-    walls, at most the range of the proximity sensor. ``settings``: of the active run. ``rng``: for random choices.
+    ``particles`` (M, 3), ``weights`` (M,): the belief. ``modes``: its significant modes. ``sensors``: models of the
+    sensors. ``space``: the free space between walls. ``candidates``: C paths. ``free`` (C,) [m]: the length of each
+    path that is free of walls, at most the range of the proximity sensor. ``settings``: of the active run. ``rng``: for
+    random choices.
     """
 
     particles: Array
@@ -62,8 +63,9 @@ class Situation:
 class Choice:
     """The choice of a policy.
 
-    ``path``: the chosen path, or None if there is no candidate. ``metres`` [m]: the distance after which the policy chooses again.
-    ``values`` (C,): the scores of the candidates, NaN if not evaluated; empty if the policy does not compare candidates.
+    ``path``: the chosen path, or None if there is no candidate. ``metres`` [m]: the driven distance after which the
+    policy chooses again. ``values`` (C,): the scores of the candidates, NaN if not evaluated. Empty if the policy does
+    not compare candidates.
     """
 
     path: Path | None
@@ -81,9 +83,9 @@ Policy = Callable[[Situation], Choice]
 def information(s: Situation, sign: float = 1.0) -> Choice:
     """Choose the path with the largest expected information. If ``sign`` is -1, prefer the smallest, for comparison.
 
-    Near paths are evaluated first. If no near path gains enough for its length and the belief has few modes, paths to
-    distant places are evaluated. If these are not informative either, or if the pose is unknown, :func:`patrol`
-    chooses.
+    Short candidates (arcs, straight paths, a turn in place) are evaluated first. If none gains enough for its length
+    and the belief has few modes, the candidates to distant places are evaluated. If these are not informative either,
+    or if the pose is unknown, :func:`patrol` chooses.
     """
     settings = s.settings.policy
     if not s.sensors.forecasts or not s.candidates:
@@ -109,7 +111,7 @@ def information(s: Situation, sign: float = 1.0) -> Choice:
 
 
 def _near_gains(s: Situation, paths: Sequence[Path]) -> Array:
-    """Return the expected reduction of the belief's entropy (C,) [nats] on each of C near paths."""
+    """Return the expected reduction of the belief's entropy (C,) [nats] on each of C short paths."""
     samples = s.settings.policy.samples
     gains = expected_gain(s.sensors, s.particles, s.weights, paths, s.rng, samples=samples, space=s.space)
     if len(s.modes) != 1:
@@ -120,11 +122,11 @@ def _near_gains(s: Situation, paths: Sequence[Path]) -> Array:
 
 
 def _far_gains(s: Situation, paths: Sequence[Path]) -> Array:
-    """Return the expected information (C,) [nats] of C long paths. It is about the true mode, or with one mode about
-    the pose.
+    """Return the expected information (C,) [nats] of C paths to distant places. With one mode it is about the pose.
+    With several modes it is about the question which mode is true.
 
-    With several modes the information about poses is not used. On a long path particles diverge and run into walls,
-    which the real robot avoids by planning again.
+    The information about poses is then ignored. On a long path particles diverge and run into walls, which the real
+    robot avoids by planning again.
     """
     if len(s.modes) == 1:
         (mode,) = s.modes
@@ -149,7 +151,8 @@ def _costs(s: Situation, rows: Sequence[int], per_metre: float) -> Array:
 
 
 def random(s: Situation) -> Choice:
-    """Choose a near path or a turn in place at random, and follow it to its end."""
+    """Choose at random among the candidates except paths to distant places, and follow the path to its end. The
+    candidates are arcs, straight paths and a turn in place."""
     arcs = [p for p in s.candidates if p.kind != FAR]
     if not arcs:
         return NO_PATH
@@ -159,8 +162,8 @@ def random(s: Situation) -> Choice:
 
 
 def patrol(s: Situation) -> Choice:
-    """Drive straight ahead until a wall is near, then in the direction with the most free space. Turn back only if no
-    other direction is free."""
+    """Drive straight ahead until a wall is near, then choose the direction with the most free space. Turn back only if
+    no other direction is free."""
     straight = [(i, p) for i, p in enumerate(s.candidates) if _is_straight(p)]
     if not straight:
         return NO_PATH
@@ -181,7 +184,7 @@ def patrol(s: Situation) -> Choice:
 
 
 def nearest_tags(s: Situation) -> Choice:
-    """Choose the path with the smallest mean distance from its end to the nearest tags, on average over the belief."""
+    """Choose the path with the smallest mean distance from its end to the nearest tags, averaged over the belief."""
     if not len(s.sensors.goals) or not s.candidates:
         return patrol(s)
     rows = s.rng.choice(len(s.weights), s.settings.policy.samples, p=s.weights / s.weights.sum())
@@ -205,10 +208,10 @@ def policy(name: str) -> Policy:
 
 
 def usable(paths: Sequence[Path], free: Array, sight: float) -> tuple[tuple[Path, ...], Array]:
-    """Return the paths that are free in their first metre, and their free lengths.
+    """Return the paths that are free of walls in their first metre, and their free lengths [m] as an array.
 
-    ``free`` (C,) [m]: the free length of each path. ``sight`` [m]: the range of the proximity sensor. A path that is
-    not free up to this range is shortened to its free length.
+    ``free`` (C,) [m]: the free length of each of C ``paths``. ``sight`` [m]: the range of the proximity sensor. A path
+    that is not free up to this range is shortened to its free length.
     """
     keep = [i for i, p in enumerate(paths) if free[i] >= min(AHEAD, p.length, sight) - 1e-9]
     return tuple(paths[i].until(float(free[i])) if free[i] < sight else paths[i] for i in keep), free[keep]

@@ -38,9 +38,9 @@ BETWEEN = 5  # collision checks between two poses of a path
 
 
 class ProximitySensor:
-    """A sensor that measures the distance to the next wall in D directions around the robot, up to its range ``sight`` [m].
+    """A sensor of the distances to the next wall in D directions around the robot, up to its range ``sight`` [m].
 
-    D is :data:`~factorgraph_loc.planning.paths.DIRECTIONS`. ``space``: the free space between walls.
+    D is :data:`~factorgraph_loc.planning.paths.DIRECTIONS`, 12. ``space``: the free space between walls.
     """
 
     def __init__(self, space: FreeSpace, sight: float) -> None:
@@ -49,12 +49,12 @@ class ProximitySensor:
         self._sight = sight
 
     def expected(self, poses: Array) -> Array:
-        """Return the expected free lengths (M, D) [m] at ``poses`` (M, 3)."""
+        """Return the free lengths (M, D) [m] in D directions at ``poses`` (M, 3), measurements without noise."""
         steps = free_steps(self.space, poses, self._rays)
         return np.stack([ray.metres[at] for ray, at in zip(self._rays, steps, strict=True)], axis=1)
 
     def read(self, pose: Array, rng: np.random.Generator) -> Array:
-        """Simulate a measurement at the true ``pose`` (3,). Returns free lengths (D,) [m]."""
+        """Simulate a measurement at the true ``pose`` (3,). Returns free lengths (D,) [m] in D directions."""
         true = self.expected(pose[None])[0]
         return np.asarray(np.clip(true + SIGMA * rng.standard_normal(len(true)), 0.0, self._sight))
 
@@ -69,11 +69,12 @@ class ProximitySensor:
 
 
 class SimulatedRobot:
-    """A simulated robot: it follows paths, and reports odometry and measurements.
+    """A simulated robot that follows paths, and reports odometry and measurements.
 
-    Its odometry has the errors of :func:`~factorgraph_loc.sensors.odometry.simulation.wheel_odometry`. The robot controls its
-    motion by the reported odometry, so that its true motion differs from the path. Motion and sensors use separate random
-    sequences. Two robots with the same seed therefore have the same noise as long as they drive the same path.
+    Its odometry has the errors of :func:`~factorgraph_loc.sensors.odometry.simulation.wheel_odometry`. The robot
+    controls its motion by the reported odometry, so that its true motion differs from the path. Motion and sensors use
+    separate random sequences. Two robots with the same seed therefore have the same noise as long as they drive the
+    same path.
     """
 
     def __init__(
@@ -113,7 +114,7 @@ class SimulatedRobot:
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """The names of the channels of the robot's measurements."""
+        """The names of the channels (measurement streams) of the robot."""
         return (IncrementOdometry.sensor, *(channel for channel, _ in self._order))
 
     @property
@@ -123,7 +124,7 @@ class SimulatedRobot:
         return tuple(channel for channel, sensor in self._order if sensor.decides or not any_decides)
 
     def begin(self) -> Iterator[Measurement]:
-        """Yield the measurements before the first motion: one of odometry without motion, and one of each other sensor."""
+        """Yield the measurements before the first motion: one of odometry at rest, and one of each other sensor."""
         yield IncrementOdometry(0.0, 0.0, 0.0, 0.0)
         yield from self._measure()
 
@@ -178,7 +179,7 @@ class SimulatedRobot:
                 yield m if kind_of(channel) == channel else replace(m, source=channel)  # type: ignore[type-var]
 
     def _reported_motions(self, path: Array, metres: float) -> Array:
-        """Return the motions (N, 3) of N control periods along at most ``metres`` [m] of a path, as odometry reports
+        """Return the motions (N, 3) in N control periods along at most ``metres`` [m] of a path, as odometry reports
         them. Each is in the frame of the robot before the motion."""
         twists = se2.log(se2.between(path[:-1], path[1:]))
         lengths = np.hypot(twists[:, 0], twists[:, 1])
@@ -193,7 +194,7 @@ class SimulatedRobot:
         return se2.between(at[:-1], at[1:])
 
     def _is_free(self, target: Array) -> bool:
-        """True if the robot may move to ``target`` (3,), where the cell must be free. From a cell that is not free, the
-        robot may also move to cells that are not nearer to a wall."""
+        """True if the cell of ``target`` (3,) is free. If the robot is in a cell that is too close to a wall, also True
+        if the target is not nearer to a wall."""
         ahead = Path(np.stack((np.zeros(3), se2.between(self.pose, target))), "step")
         return bool(free_steps(self._space, self.pose[None], [ahead])[0, 0])

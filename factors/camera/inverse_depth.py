@@ -54,12 +54,12 @@ def positions(rays: Array) -> tuple[Array, Array]:
 
 
 def linearize(model: CameraModel, position: Array, rotation: Array, rays: Array) -> tuple[Array, Array, Array]:
-    """Predict the pixels of points in a camera at ``position`` (3,) with ``rotation`` (3, 3) in the world. The points
+    """Predict the pixels of K points in a camera at ``position`` (3,) with ``rotation`` (3, 3) in the world. The points
     are given as ``rays`` (K, 6): x, y, z of the start, azimuth, elevation, inverse depth.
 
-    Returns the pixels (K, 2) and their Jacobians by the camera's perturbation (K, 2, 6), as in
-    :func:`~factors.camera.model.linearize_in_space`, and by the rays (K, 2, 6). A pixel depends only on the direction
-    from the camera to the point, so the inverse depth may be zero.
+    Returns the pixels (K, 2) and their Jacobians by the camera's perturbation (K, 2, 6) and by the rays (K, 2, 6). The
+    perturbation is that of :func:`~factors.camera.model.linearize_in_space`. A pixel depends only on the direction from
+    the camera to the point, so the inverse depth may be zero.
     """
     ahead, by_angles = directions(rays)
     inverse = rays[:, 5, None]
@@ -80,9 +80,9 @@ def begin(
 ) -> tuple[Array, Array, Array]:
     """Initialise the ray of a point from its first ``pixel`` (2,) and an assumed ``inverse_depth`` [1/m].
 
-    ``position`` (3,), ``rotation`` (3, 3): the camera's pose in the world. Returns the ray (6,) (camera position,
-    azimuth, elevation, inverse depth), and its Jacobians by the perturbation (6, 6) of the camera's pose, and by pixel
-    and inverse depth (6, 3).
+    ``position`` (3,), ``rotation`` (3, 3): the camera's pose in the world. Returns the ray (6,): camera position,
+    azimuth, elevation, inverse depth. Also returns its Jacobians by the perturbation (6, 6) of the camera's pose, and
+    by pixel and inverse depth (6, 3).
     """
     (local,) = rays(model, pixel[None])
     _, _, by_local = linearize_in_space(model, np.zeros(3), np.eye(3), local[None])

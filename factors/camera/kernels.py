@@ -253,8 +253,8 @@ def project_planar(
 
 @compiled(error_model="numpy")
 def linearize(camera: tuple[Lens, Array, Array], pose: Array, points: Array) -> tuple[Array, Array]:
-    """Return the pixels (K, 2) of world ``points`` (K, 3) from a level robot at ``pose`` (3,), and the Jacobians (K, 2,
-    WIDTH) of :func:`project_planar`. ``camera``: lens, and position (3,) and rotation (3, 3) in the robot frame."""
+    """Return the pixels (K, 2) of world ``points`` (K, 3) from a level robot at ``pose`` (3,), and their Jacobians (K,
+    2, WIDTH). ``camera``: lens, position (3,) and rotation (3, 3) in the robot frame. See :func:`project_planar`."""
     pixels, jacobian = np.empty((len(points), 2)), np.empty((len(points), 2, WIDTH))
     level, upright = np.zeros(2), np.eye(3)
     for i in range(len(points)):

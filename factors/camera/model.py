@@ -101,8 +101,8 @@ class CameraModel:
 def mounting(roll: float, pitch: float, yaw: float) -> Array:
     """Return the rotation (3, 3) of a camera in the robot frame from three angles [rad].
 
-    A forward-facing camera is rotated by ``roll`` about x, by ``pitch`` about y (positive is down), and by ``yaw``
-    about z (positive is left), in this order, about the fixed axes of the robot.
+    A forward-facing camera is rotated about the fixed axes of the robot: by ``roll`` about x, then by ``pitch`` about y
+    (positive is down), then by ``yaw`` about z (positive is left).
     """
     return np.asarray(gtsam.Rot3.RzRyRx(roll, pitch, yaw).matrix() @ FORWARD)
 
@@ -217,7 +217,7 @@ def folded(model: CameraModel) -> Array | None:
 def linearize(model: CameraModel, pose: Array, points: Array) -> tuple[Array, Array, Array, Array]:
     """Predict the pixels of world ``points`` (K, 3) from the robot's planar ``pose`` (3,), with derivatives.
 
-    Returns the pixels (K, 2) and their Jacobians by the pose's body-frame perturbation (K, 2, 3), by the points (K, 2,
+    Returns the pixels (K, 2) and three Jacobians: by the pose's body-frame perturbation (K, 2, 3), by the points (K, 2,
     3), and by corrections of :data:`PARAMETERS` (K, 2, 8). The derivative by the time offset is set to zero.
     """
     camera = lens_of(model), model.position, model.rotation
@@ -236,7 +236,8 @@ def by_tilt(model: CameraModel, by_parameters: Array) -> Array:
 def linearize_in_space(
     model: CameraModel, position: Array, rotation: Array, points: Array
 ) -> tuple[Array, Array, Array]:
-    """Predict the pixels of world ``points`` (K, 3) in a camera at ``position`` (3,) with ``rotation`` (3, 3) in the world.
+    """Predict the pixels of world ``points`` (K, 3) in a camera at ``position`` (3,) with ``rotation`` (3, 3), with
+    derivatives.
 
     Returns the pixels (K, 2) and their Jacobians by the camera's perturbation (K, 2, 6) and by the points (K, 2, 3).
     The perturbation is in the camera frame with rotation before translation, as in ``gtsam.Pose3``.
@@ -275,8 +276,8 @@ def log_likelihood(
 
 def lens_of(model: CameraModel) -> Lens:
     """Return the camera's intrinsic constants as a tuple for compiled code, see :data:`factors.camera.kernels.Lens`.
-    The distortion is valid up to the radius at which its radial part stops growing, or up to the limit
-    :data:`WIDEST` (:data:`WIDEST_FISHEYE` of a fisheye lens)."""
+    The distortion is valid up to the radius at which its radial part stops growing. This radius is limited to
+    :data:`WIDEST`, or to :data:`WIDEST_FISHEYE` for a fisheye lens."""
     focal = model.fx, model.fy, model.cx, model.cy
     if not any(model.distortion) and not model.fisheye:
         return (*map(float, focal), *(0.0,) * 5)

@@ -36,7 +36,7 @@ def triangulated(
     [rad]: the smallest allowed angle between the outermost rays. ``nearest`` [m]: the smallest allowed depth.
     ``robust``: the scale of Huber's loss in standard deviations, infinite for least squares.
 
-    Returns four values: True if the parallax is large enough and the point certain enough, the point (3,) in the world,
+    Returns True if the parallax is large enough and the point certain enough. Also returns the point (3,) in the world,
     its covariance (3, 3), and the squared norms (M,) of its whitened residuals. The norms are infinite if the point is
     not at least ``nearest`` in front of all cameras.
 

@@ -205,8 +205,8 @@ def placed(position: Array, rotation: Array, tilt: float, pose: Array, covarianc
     ``tilt`` [rad]: the standard deviation of the robot's roll and pitch.
     ``pose`` (3,), ``covariance`` (3, 3): the robot's planar pose, and its body-frame covariance.
 
-    The results are the camera's position (3,) and rotation (3, 3) in the world, and the covariance (6, 6) of its
-    perturbation in the camera frame, with rotation before translation.
+    The results are the camera's position (3,) and rotation (3, 3) in the world, and a covariance (6, 6). It is that of
+    the perturbation in the camera frame, with rotation before translation.
     """
     c, s = math.cos(pose[2]), math.sin(pose[2])
     where, turned, lift, carried = np.empty(3), np.empty((3, 3)), np.zeros((6, POINT)), np.empty((6, 6))

@@ -154,8 +154,8 @@ class BearingRangeFactor:
         return kernels.predicted(self.model.packed, self.packed, pose, contiguous)
 
     def resolved(self, values: Sequence[Array], covariance: Array) -> ResolvedFactor:
-        """Return the factor with Gaussian measurements in place of ranges that may be too long, for a Kalman update. It
-        is valid for one prediction: the ``values`` of the variables with the joint ``covariance`` (D, D)."""
+        """Return a factor to use in a Kalman update. Gaussian measurements replace ranges that may be too long. It is
+        valid for one prediction: the ``values`` of the variables with the joint ``covariance`` (D, D)."""
         error, blocks, slopes = self._linearized(values)
         jacobian, changed, weights = np.concatenate(blocks, axis=2), error.copy(), np.ones(len(error))
         columns, contiguous = np.arange(len(covariance)), np.ascontiguousarray(covariance)
@@ -184,8 +184,8 @@ class BearingRangeFactor:
         return self.ranges - values[1 + bool(self.estimated)][0] if self.biased else self.ranges
 
     def _whitened(self, values: Sequence[Array], bias: float = 0.0) -> tuple[Array, Array]:
-        """Return the whitened residual (K, 2) with ``bias`` [m] added to the range bias, and its Jacobian (K, 2, WIDTH)
-        by the pose, the landmark and all sensor constants."""
+        """Return the whitened residual (K, 2) with ``bias`` [m] added to the range bias. Also returns its Jacobian (K,
+        2, WIDTH) by the pose, the landmark and all sensor constants."""
         packed, changes, count = self.packed, np.zeros(len(PARAMETERS)), len(self.ranges)
         if self.estimated:
             changes[list(self.estimated)] = values[1]
@@ -334,7 +334,7 @@ class BearingRangeStack:
 
     @property
     def first(self) -> Integers:
-        """The index (2 K,) of the pose that each residual depends on, for the K landmarks of all factors together."""
+        """The index (2 K,) of the pose that each residual depends on. K is the number of landmarks of all factors."""
         return np.repeat(np.repeat(self._pose_of, np.diff(self._ends, prepend=0)), 2)
 
     def linearize(self, poses: Array, parameters: Array, jacobian: Array, residual: Array) -> None:

@@ -202,15 +202,14 @@ def updated(
     converged: float,
     gate: float,
 ) -> tuple[Array, Array, Array, float, int]:
-    """The robust, iterated Kalman update by one measurement of landmarks. See :func:`factors.update.update_state`.
+    """Run a robust, iterated Kalman update by one measurement of K landmarks. See :func:`factors.update.update_state`.
     ``model`` (14,): the array ``packed`` of a :class:`~factors.landmarks.model.BearingRangeModel`. ``packed``: the
     measurement, see :data:`Sighting`. ``pose`` (3,), ``covariance`` (S, S): the prediction. The first three components
-    of the error state are the pose.
-    ``values`` (P,), ``indices`` (P,): corrections of the estimated sensor constants, and their indices in
-    :data:`~factors.landmarks.model.PARAMETERS`.
-    ``first``: the index of the first of these constants in the error state.
+    of the error state are the pose. ``values`` (P,), ``indices`` (P,): corrections of the estimated sensor constants,
+    and their indices in :data:`~factors.landmarks.model.PARAMETERS`. ``first``: the index of the first of these in the
+    error state.
     ``gate``: the noise of a landmark is increased if its normalised innovation squared exceeds this limit.
-    Returns the correction (S,), the corrected covariance (S, S), the whitened residuals (K, 2) of the prediction, the
+    Returns the correction (S,), the new covariance (S, S), the whitened residuals (K, 2) of the prediction, the
     normalised innovation squared, and the number of measured values. Raises LinAlgError if a covariance is singular.
     """
     count, size = len(packed[0]), len(covariance)

@@ -138,8 +138,8 @@ class LateShares:
     """A Bayesian filter that estimates how many ranges of a sensor are late (too long), and by how much. Immutable.
 
     ``probability``: the prior probability that the sensor has late ranges.
-    ``log_weights`` (noises, 1 + H): log posterior probabilities of hypotheses, for a few noise levels of direct ranges
-    and for no or one of H distributions of late ranges. None means the prior.
+    ``log_weights`` (noises, 1 + H): log posterior probabilities of hypotheses. A row is a noise level of direct ranges.
+    The first column means no late ranges, the others mean H distributions of late ranges. None means the prior.
     ``expected``: the statistics of late ranges, averaged over all hypotheses.
     """
 

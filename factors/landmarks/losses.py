@@ -39,8 +39,8 @@ def loss(model: Array, error: Array, slopes: Array) -> float:
 @compiled
 def reweigh(model: Array, error: Array, slopes: Array, weights: Array) -> None:
     """Write the weights of K squared residuals for iteratively reweighted least squares into ``weights`` (K,). The
-    ``error`` of a range that may be late (too long) changes in place, so that weight times error is the derivative of
-    the loss. The other arguments are those of :func:`loss`."""
+    ``error`` of a range that may be late (too long) changes in place. Weight times error is then the derivative of the
+    loss. The other arguments are those of :func:`loss`."""
     for k in range(len(error)):
         if slopes[k] > 0.0 and model[LATE] > 0.0:
             late = model[ROBUST], model[LATE], model[LATE + 1], model[LATE + 2]
@@ -52,7 +52,7 @@ def reweigh(model: Array, error: Array, slopes: Array, weights: Array) -> None:
 
 @compiled
 def weigh(model: Array, error: Array, jacobian: Array, slopes: Array) -> None:
-    """Apply :func:`reweigh`, and multiply the whitened residuals ``error`` (K, 2) and their ``jacobian`` (K, 2, D), in
+    """Apply :func:`reweigh`. Then multiply the whitened residuals ``error`` (K, 2) and their ``jacobian`` (K, 2, D), in
     place, by the square roots of the weights. The other arguments are those of :func:`loss`."""
     weights = np.empty(len(error))
     reweigh(model, error, slopes, weights)

@@ -230,9 +230,9 @@ class OdometryChain:
         """Predict a pose (3,) with body-frame ``covariance`` (3, 3) from the odometry state ``start`` to K ``times``
         [s].
 
-        ``constants`` (P,): corrections of the estimated odometry constants. Returns the odometry states (K, 8) with the
-        fields of :class:`ChainState`, the poses (K, 3), their body-frame covariances (K, 3, 3), and their covariances
-        (K, 3, 3) of (x, y, heading) in the world frame.
+        ``constants`` (P,): corrections of the estimated odometry constants. Returns four arrays: the odometry states
+        (K, 8), see :class:`ChainState`; the poses (K, 3); their body-frame covariances (K, 3, 3); their covariances (K,
+        3, 3) of (x, y, heading) in the world frame.
         """
         count = len(times)
         states, poses = np.empty((count, STATE)), np.empty((count, 3))

@@ -46,8 +46,8 @@ class OdometryStack:
         return np.repeat(self._first, 3)
 
     def linearize(self, poses: Array, parameters: Array, jacobian: Array, residual: Array) -> None:
-        """Write the whitened residuals into ``residual`` (3 K,), and their Jacobian by the first pose, the second pose
-        and the P parameters into ``jacobian`` (3 K, 6 + P)."""
+        """Write the whitened residuals into ``residual`` (3 K,), at ``poses`` (N, 3) and ``parameters`` (P,). Write
+        their Jacobian by the first pose, the second pose and the parameters into ``jacobian`` (3 K, 6 + P)."""
         given = self._steps, self._constants(parameters), self._indices
         linearize_all(poses, self._first, *given, jacobian, residual, 6 + self._column)
 
@@ -64,7 +64,7 @@ class OdometryFactor:
 
     ``increment``: the measured motion. ``estimated``: the indices in :data:`factors.odometry.model.PARAMETERS` of the P
     constants that are estimated. The methods take ``values``, a list of the pose (3,) at the start, the pose (3,) at
-    the end, and the corrections (P,) of the constants if P > 0.
+    the end, and, if P > 0, the corrections (P,) of the constants.
     """
 
     def __init__(self, increment: Increment, estimated: Sequence[int] = ()) -> None:
@@ -92,8 +92,8 @@ class OdometryFactor:
         return OdometryStack(factors, numbers, column)
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Return the whitened residual (3,) ``log(delta^-1 * start^-1 * end)``, and a list of its Jacobians by each of
-        ``values``, the variables in the class docstring."""
+        """Return the whitened residual (3,) ``log(delta^-1 * start^-1 * end)``, and a list of its Jacobians by each
+        variable. ``values``: the variables, as in the class docstring."""
         start, end, *constants = values
         if constants:
             changed = self._arc, self._moving, constants[0], self._indices
@@ -119,7 +119,7 @@ class ScaleFreeOdometryFactor(OdometryFactor):
     kind = None  # always linearised alone
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Return the whitened residual (3,) and its Jacobian by each value. The residual is that of
+        """Return the whitened residual (3,) and a list of its Jacobians by each variable. The residual is that of
         :class:`OdometryFactor` with the translation divided by the estimated scale of distances."""
         start, end, *constants = values
         if not constants:
@@ -220,8 +220,8 @@ def linearize_all(
     residual: Array,
     column: int,
 ) -> None:
-    """Linearise K increments ``steps``. Writes the whitened residuals into ``residual`` (3 K,), and their Jacobian by
-    the first pose, the second pose and the parameters of the graph into ``jacobian`` (3 K, 6 + P).
+    """Linearise K increments ``steps``. Writes the whitened residuals into ``residual`` (3 K,). Writes their Jacobian
+    by the first pose, the second pose and the parameters of the graph into ``jacobian`` (3 K, 6 + P).
 
     ``poses`` (N, 3), ``first`` (K,): increment k is between the poses ``first[k]`` and ``first[k] + 1``.
     ``constants``, ``indices``: as in :func:`factors.odometry.kernels.changed`.

@@ -63,7 +63,7 @@ class OdometryModel:
     response. ``turn_slowdown`` [m/rad]: the loss of forward speed per turn rate, for commanded velocities.
     ``max_hold`` [s]: the longest time for which a velocity is assumed to continue. After that the motion is unknown.
     ``unknown_distance`` [m per sqrt(s)], ``unknown_rotation`` [rad per sqrt(s)]: the noise of an unknown motion.
-    ``along``, ``lateral``, ``heading``: the noise along the direction of travel, across that direction, and of the heading.
+    ``along``, ``lateral``, ``heading``: the noise along the direction of travel, across it, and of the heading.
     """
 
     scale_distance: float = 1.0

@@ -222,8 +222,8 @@ class RfidLikelihood:
         """Return the tempered likelihood of ``counts`` at one pose (3,) and ``parameters`` (Q,), with derivatives.
 
         ``estimated`` (P,): the indices of the parameters that derivatives are computed for. None means all. The
-        gradient (1, 3 + P) and the information (1, 3 + P, 3 + P) are by the body-frame perturbation of the pose and by
-        these parameters.
+        gradient has the shape (1, 3 + P), the information (1, 3 + P, 3 + P). The first three components are the
+        body-frame perturbation of the pose, the others are these parameters.
         """
         places = np.array(range(len(parameters)) if estimated is None else estimated, dtype=np.int64)
         pose, alpha = np.ascontiguousarray(pose, dtype=float), float(self.model.tempering)
@@ -318,8 +318,9 @@ class RfidLikelihood:
         return robot_tables(antennas, self.tags.points[:, 2], finest, facings if self.uses_facing else 0)
 
     def by_tag(self, pose: Array, counts: TagReadCounts) -> tuple[Array, Array, Array]:
-        """Return the tempered negative log-likelihood (T,) of each tag's reads at one robot pose (3,), its gradient (T,
-        2) by the tag's world position, and its Fisher information (T, 2, 2). ``counts`` must list all tags."""
+        """Return three arrays about the reads of each tag at one robot pose (3,): the tempered negative log-likelihood
+        (T,), its gradient (T, 2) by the tag's world position, and its Fisher information (T, 2, 2). ``counts`` must
+        list all tags."""
         arrays, alpha = counts.packed[:4], self.model.tempering
         pose = np.asarray(pose, dtype=float)
         nll, slope, curve = kernels.by_tag(self.packed, pose, self.tags.points, self.tags.normals, *arrays)
@@ -331,7 +332,7 @@ class RfidLikelihood:
         return ExpectedReads(*kernels.predicted(*self.arrays, counts.packed, pose, parameters))
 
     def probabilities(self, poses: Array, antenna: int) -> Array:
-        """Return the probability (N, T), including false reads, that one round of the antenna with index ``antenna``
-        reads each of T tags, with the robot at each of ``poses`` (N, 3)."""
+        """Return the probability (N, T) that one inventory round reads each of T tags, with the robot at each of
+        ``poses`` (N, 3). False reads are included. ``antenna``: the index of the antenna."""
         poses, antennas = np.ascontiguousarray(poses, dtype=float), np.full(len(poses), antenna)
         return kernels.probabilities(self.packed, antennas, poses, self.tags.points, self.tags.normals)[0]

@@ -133,8 +133,8 @@ class RfidFactor:
         return self.likelihood.log_likelihood(poses, self.reads, self._parameters(values))
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Return the residual (4 + P,), and its Jacobians by the pose (4 + P, 3) and, if P > 0, by the estimated
-        parameters (4 + P, P)."""
+        """Return the residual (4 + P,) and a list of its Jacobians by the variables: by the pose (4 + P, 3) and, if P >
+        0, by the estimated parameters (4 + P, P)."""
         score = self.score(values)
         residual, jacobian = compressed(float(score.nll[0]), score.gradient[0], score.information[0])
         return residual, [jacobian[:, :3], jacobian[:, 3:]] if self.estimated else [jacobian]
@@ -200,8 +200,8 @@ class RfidTagFactor:
         return self.score(values)[0]
 
     def score(self, values: Sequence[Array]) -> tuple[float, Array, Array]:
-        """Return the tempered negative log-likelihood, and its gradient (5,) and Fisher information (5, 5) by the
-        body-frame perturbation of the pose (3) and by the tag's position in the world (2)."""
+        """Return the tempered negative log-likelihood, its gradient (5,) and its Fisher information (5, 5). Derivatives
+        are by the body-frame perturbation of the pose (3) and by the tag's position in the world (2)."""
         tags, counts, alpha = self.likelihood.tags, self.counts, self.likelihood.model.tempering
         point = np.array([(values[1][0], values[1][1], tags.points[self.tag, 2])])
         hits = np.ascontiguousarray(counts.hits[:, self.tag : self.tag + 1])

@@ -40,7 +40,7 @@ class TagIndex(NamedTuple):
 
 
 def tag_index(points: Array) -> TagIndex:
-    """Make the index of tags at ``points`` (T, 3) [m]."""
+    """Return the spatial index of tags at ``points`` (T, 3) [m]."""
     if not len(points):
         return TagIndex(np.zeros(2), CELL, 1, np.zeros(2, dtype=np.int64), np.empty(0, dtype=np.int64))
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
@@ -55,8 +55,8 @@ def tag_index(points: Array) -> TagIndex:
 
 @compiled(inline="always")
 def cells(index: TagIndex, low: float, high: float, axis: int, count: int) -> tuple[int, int]:
-    """The first and last cell along an axis (0 for x, 1 for y) that the interval from ``low`` to ``high`` [m] touches.
-    ``count``: number of cells along the axis. Returns (0, -1) if the interval touches none."""
+    """Return the first and last cell along an axis (0 for x, 1 for y) that the interval from ``low`` to ``high`` [m]
+    touches. ``count``: number of cells along the axis. Returns (0, -1) if the interval touches none."""
     first = (low - index.corner[axis]) / index.cell
     last = (high - index.corner[axis]) / index.cell
     if not (first < count and last >= 0.0):
@@ -66,7 +66,7 @@ def cells(index: TagIndex, low: float, high: float, axis: int, count: int) -> tu
 
 @compiled
 def within(index: TagIndex, low: Array | Corner, high: Array | Corner) -> NDArray[np.int64]:
-    """The indices in the map, ascending, of all tags in the cells that the box from ``low`` to ``high`` (2,) [m] touches."""
+    """Return the map indices of all tags whose cells touch the box from ``low`` to ``high`` (2,) [m], ascending."""
     rows = (len(index.start) - 1) // index.columns
     first_x, last_x = cells(index, low[0], high[0], 0, index.columns)
     first_y, last_y = cells(index, low[1], high[1], 1, rows)
@@ -86,8 +86,8 @@ def within(index: TagIndex, low: Array | Corner, high: Array | Corner) -> NDArra
 
 
 class MapTags(NamedTuple):
-    """The tags of a map: ``points`` (T, 3) [m], ``normals`` (T, 2) (facing directions, zero if unknown), and the
-    spatial index ``cells``."""
+    """The tags of a map: ``points`` (T, 3) [m], ``normals`` (T, 2) (unit vectors of the tags' fronts, zero if unknown),
+    and ``cells``, the spatial index."""
 
     cells: TagIndex
     points: Array
@@ -120,7 +120,7 @@ def _box(poses: Array, reach: float) -> tuple[Corner, Corner]:
 
 @compiled
 def near_tags(of_map: MapTags, counts: Counts, poses: Array, reach: float) -> NearTags:
-    """Select the tags that may change the likelihood of poses (N, 3): at least all tags within ``reach`` [m] of any
+    """Return the tags that may change the likelihood of poses (N, 3): at least all tags within ``reach`` [m] of any
     pose, and the tags listed in ``counts`` (:attr:`factors.rfid.detection.TagReadCounts.packed`)."""
     _, _, _, hits, odds, elsewhere, listed, unlisted_odds, _ = counts
     low, high = _box(poses, reach)
@@ -137,7 +137,7 @@ def near_tags(of_map: MapTags, counts: Counts, poses: Array, reach: float) -> Ne
 
 @compiled
 def moved(offset: Array, offsets: Array) -> Array:
-    """The poses (K, 3) that result from composing the pose ``offset`` (3,) with each of ``offsets`` (K, 3)."""
+    """Return the poses (K, 3) that result from composing the pose ``offset`` (3,) with each of ``offsets`` (K, 3)."""
     c, s, out = math.cos(offset[2]), math.sin(offset[2]), np.empty_like(offsets)
     for k in range(len(offsets)):
         out[k, 0] = offset[0] + c * offsets[k, 0] - s * offsets[k, 1]
@@ -148,7 +148,7 @@ def moved(offset: Array, offsets: Array) -> Array:
 
 @compiled
 def delayed(poses: Array, twists: Array, delays: Array) -> Array:
-    """The poses (K, 3) of a robot ``delays`` (K or 1,) [s] later, for body-frame velocities ``twists`` (K or 1, 3)."""
+    """Return the poses (K, 3) ``delays`` (K or 1,) [s] after ``poses``, for body velocities ``twists`` (K or 1, 3)."""
     if not delays.any():
         return poses
     out = np.empty_like(poses)
@@ -163,7 +163,7 @@ def delayed(poses: Array, twists: Array, delays: Array) -> Array:
 
 @compiled
 def union(first: Integers, second: Integers) -> Integers:
-    """The union of the ascending arrays ``first`` and ``second``, ascending and without duplicates."""
+    """Return the union of the ascending arrays ``first`` and ``second``, ascending and without duplicates."""
     out = np.empty(len(first) + len(second), np.int64)
     i = j = count = 0
     while i < len(first) or j < len(second):
@@ -182,8 +182,9 @@ def union(first: Integers, second: Integers) -> Integers:
 def listing(
     listed: Integers, hits: Integers, odds: Array, elsewhere: Array, unlisted_odds: float, tags: Integers
 ) -> tuple[Integers, Array, Array]:
-    """Return the hits (K, U), odds (U,) and elsewhere (U,) of ``tags`` (U,), from the values of the ``listed`` tags.
-    Both arrays of tags are ascending. A tag that is not listed has 0 hits, ``unlisted_odds``, and 0 for elsewhere."""
+    """Return the hits (K, U), odds (U,) and elsewhere (U,) of ``tags`` (U,), from the values of the C ``listed`` tags:
+    ``hits`` (K, C), ``odds`` (C,), ``elsewhere`` (C,). Both arrays of tags are ascending. A tag that is not listed has
+    0 hits, ``unlisted_odds``, and 0 for elsewhere."""
     new_hits = np.zeros((len(hits), len(tags)), np.int64)
     new_odds, new_elsewhere = np.full(len(tags), unlisted_odds), np.zeros(len(tags))
     i = 0

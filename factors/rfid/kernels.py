@@ -27,8 +27,9 @@ MOST_COLUMNS = 8  # largest number of components of pose and parameters that one
 def tag_logit(
     packed: Packed, antenna: int, p: float, q: float, height: float, c: float
 ) -> tuple[float, float, float, float, float]:
-    """The logit of a tag at (p, q, height) from the antenna, and its derivatives by p, q, height and c. The axes have
-    the antenna's yaw but no pitch. ``c``: the facing cosine."""
+    """Return the logit of a tag at (p, q, height) [m] from the antenna, and its derivatives by p, q, height and c. The
+    axes have the antenna's yaw but no pitch. ``c``: the cosine of the angle between the tag's front and the direction
+    to the antenna."""
     cp, sp = packed.antennas[antenna, 5], packed.antennas[antenna, 6]
     m = packed.which[antenna]
     x, z = cp * p + sp * height, cp * height - sp * p
@@ -42,9 +43,9 @@ def tag_logit(
 def of_tag(
     packed: Packed, antenna: int, x: float, y: float, c: float, s: float, point: Array, normal: Array
 ) -> tuple[float, float, float, float, float]:
-    """The logit of the read probability of one tag, for an antenna at (x, y) with horizontal boresight (c, s) in the
-    frame of the tags. Also returns its derivatives by the tag's position along and across the boresight, by the antenna's
-    heading, and by the logarithm of the model's range. ``point`` (3,), ``normal`` (2,): the tag's position and facing."""
+    """Return the logit of the read probability of one tag, and four derivatives: by the tag's position along and across
+    the boresight, by the antenna's heading, and by the logarithm of the model's range. (``x``, ``y``), (``c``, ``s``):
+    position and horizontal boresight of the antenna. ``point`` (3,), ``normal`` (2,): position and front of the tag."""
     ex, ey = point[0] - x, point[1] - y
     m = packed.which[antenna]
     squared = ex * ex + ey * ey
@@ -67,8 +68,8 @@ def of_tag(
 
 @compiled(inline="always")
 def detection(packed: Packed, z: float, rate: float) -> tuple[float, float, float]:
-    """The read probability, including false reads, at the logit ``z``. Also returns its derivatives by the logit and by
-    the logarithm of ``rate``, a factor of the probability."""
+    """Return the read probability, including false reads, at the logit ``z``. Also returns its derivatives by the logit
+    and by the logarithm of ``rate``, a factor of the probability."""
     sigmoid = 1.0 / (1.0 + math.exp(-max(z, NEGLIGIBLE_LOGIT)))
     by_rate = packed.span * rate * sigmoid
     # without false reads, a probability p may be 0 or 1, so that log(p) or log(1 - p) is infinite
@@ -103,8 +104,8 @@ def mixture(
 
 @compiled(inline="always")
 def outcome(q: float, hits: int, rounds: int) -> tuple[float, float, float, float, float]:
-    """The negative log-likelihood of ``hits`` reads in ``rounds`` rounds with read probability ``q``, its derivative by
-    q, the Fisher information on q, and the mean and variance of the negative log-likelihood over all outcomes."""
+    """Return the negative log-likelihood of ``hits`` reads in ``rounds`` rounds with read probability ``q``. Also
+    returns its derivative by q, the Fisher information on q, and its mean and variance over all outcomes."""
     log_q, log_p = math.log(q), math.log1p(-q)
     nll = -(hits * log_q + (rounds - hits) * log_p)
     gradient = -(hits / q - (rounds - hits) / (1.0 - q))
@@ -116,8 +117,8 @@ def outcome(q: float, hits: int, rounds: int) -> tuple[float, float, float, floa
 
 @compiled
 def _unread(packed: Packed, rounds: Integers) -> Array:
-    """Three values for each of K measurements (K, 3): the negative log-likelihood that a tag out of range is not read,
-    and the mean and variance of the negative log-likelihood over all outcomes."""
+    """Return three values for each of K measurements (K, 3): the negative log-likelihood that a tag out of range is not
+    read, and the mean and variance of the negative log-likelihood over all outcomes."""
     out, q = np.empty((len(rounds), 3)), detection(packed, NEGLIGIBLE_LOGIT, 1.0)[0]
     for k in range(len(rounds)):
         out[k, 0], _, _, out[k, 1], out[k, 2] = outcome(q, 0, rounds[k])
@@ -224,8 +225,8 @@ def _add_measurement(
 def scores(
     packed: Packed, of_map: MapTags, counts: Counts, tempering: float, poses: Array, columns: Integers
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Compute the fields of a :class:`~factors.rfid.detection.Score` at poses (N, 3). ``packed``: adjusted models.
-    ``columns`` (Q,): the component of each parameter in the gradient, -1 if it is not estimated."""
+    """Return the fields of a :class:`~factors.rfid.detection.Score` at poses (N, 3). ``packed``: models with parameters
+    applied. ``columns`` (Q,): the component of each parameter in the gradient, -1 if it is not estimated."""
     antennas, rounds, twists = counts[1], counts[2], counts[8]
     offsets = delayed(counts[0], twists, packed.delay)
     count, scans, size = len(poses), len(antennas), 3
@@ -286,9 +287,9 @@ def scores(
 def score(
     packed: Packed, of_map: MapTags, counts: Counts, alpha: float, pose: Array, parameters: Array, estimated: Integers
 ) -> tuple[float, Array, Array, float, float]:
-    """The tempered likelihood of one pose (3,) with ``parameters`` (Q,), and its derivatives. ``packed``: models before
-    adjustment. ``alpha``: the tempering. Returns the negative log-likelihood, its gradient (3 + P,) and information (3
-    + P, 3 + P) by the pose and the parameters with indices ``estimated`` (P,), and its mean and variance."""
+    """Return five values at one pose (3,): the tempered negative log-likelihood, its gradient (3 + P,), its Fisher
+    information (3 + P, 3 + P), its mean, and its variance. Derivatives are by the pose and the parameters with indices
+    ``estimated`` (P,). ``packed``: models before ``parameters`` (Q,) are applied. ``alpha``: the tempering exponent."""
     columns = np.full(len(parameters), -1, np.int64)
     for i in range(len(estimated)):
         columns[estimated[i]] = 3 + i
@@ -308,8 +309,9 @@ def by_tag(
     rounds: Integers,
     hits: Integers,
 ) -> tuple[Array, Array, Array]:
-    """Return the untempered negative log-likelihood (T,) of each of T tags that are as in the map, at one pose (3,),
-    and its gradient (T, 5) and information (T, 5, 5) by the pose (3) and by the tag's position in the world (2)."""
+    """Return the untempered negative log-likelihood (T,) of each of T tags that are as in the map, at one pose (3,).
+    Also returns its gradient (T, 5) and Fisher information (T, 5, 5) by the pose (3) and the tag's world position (2).
+    ``offsets``, ``antennas``, ``rounds``, ``hits``: of :class:`~factors.rfid.detection.TagReadCounts`."""
     scans, tags, size = len(antennas), len(points), 5
     nll, gradient, information = np.empty(tags), np.zeros((tags, size)), np.zeros((tags, size, size))
     at, far, by = np.empty((scans, ROW)), _unread(packed, rounds), np.empty((scans, PLACE))
@@ -332,8 +334,8 @@ def by_tag(
 def probabilities(
     packed: Packed, antennas: Integers, poses: Array, points: Array, normals: Array
 ) -> tuple[Array, Array]:
-    """The probability (N, T), including false reads, that one round of antenna ``antennas[n]`` on a robot at
-    ``poses[n]`` reads each tag. Also returns the horizontal distance (N, T) [m] from the antenna to the tag."""
+    """Return two arrays (N, T): the probability, including false reads, that one round of antenna ``antennas[n]`` on a
+    robot at ``poses[n]`` reads each tag, and the horizontal distance [m] from the antenna to the tag."""
     none = np.zeros(3)
     p, distance = np.empty((len(poses), len(points))), np.empty((len(poses), len(points)))
     for n in range(len(poses)):
@@ -350,9 +352,10 @@ def probabilities(
 def predicted(
     packed: Packed, of_map: MapTags, counts: Counts, pose: Array, parameters: Array
 ) -> tuple[Integers, Integers, Array, Array]:
-    """Compute observed and predicted reads at one pose (3,), of the C tags that are near or listed in ``counts``.
-    ``packed``: models before adjustment by ``parameters`` (Q,). Returns the indices (C,) of the tags in the map, and
-    three arrays (K, C): the number of reads, the read probability, and the horizontal distance [m] from the antenna."""
+    """Return observed and predicted reads at one pose (3,) of the C tags that are near or listed in ``counts``. The
+    first array has the indices (C,) of the tags in the map. Three arrays (K, C) have the number of reads, the read
+    probability, and the horizontal distance [m] from the antenna. ``packed``: models before ``parameters`` (Q,) are
+    applied."""
     own, antennas = adjusted(packed, parameters), counts[1]
     offsets = delayed(counts[0], counts[8], own.delay)
     near = near_tags(of_map, counts, pose.copy().reshape(1, 3), reach_of(own, offsets))

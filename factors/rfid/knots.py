@@ -12,8 +12,9 @@ Place = TypeVar("Place", float, Array)
 
 
 def linear(place: Array, count: int) -> tuple[Integers, Array]:
-    """Interpolate linearly between ``count`` knots at positions ``place`` (N,), clipped to 0 ... ``count`` - 1.
-    Returns the indices (N, 2) of the neighbouring knots and their weights (N, 2), or (N, 1) if ``count`` is 1."""
+    """Compute a linear interpolation between ``count`` knots at positions 0 ... ``count`` - 1. ``place`` (N,): the
+    positions of the N results, clipped to this range. Returns the indices (N, 2) of the neighbouring knots and their
+    weights (N, 2), or (N, 1) if ``count`` is 1."""
     if count == 1:
         return np.zeros((len(place), 1), dtype=np.int64), np.ones((len(place), 1))
     below = np.clip(np.floor(place).astype(np.int64), 0, count - 2)
@@ -23,8 +24,8 @@ def linear(place: Array, count: int) -> tuple[Integers, Array]:
 
 @register_jitable
 def cubic_weights(f: Place) -> tuple[Place, Place, Place, Place]:
-    """The weights of four consecutive knots in cubic convolution. ``f``: the position between the second knot (0) and
-    the third knot (1), a number or an array."""
+    """Return the weights of four consecutive knots in cubic convolution. ``f``: the position between the second knot
+    (0) and the third knot (1), a number or an array."""
     return (
         ((-0.5 * f + 1.0) * f - 0.5) * f,
         (1.5 * f - 2.5) * f * f + 1.0,

@@ -29,21 +29,21 @@ FRONT, SIDE = 0.25, 0.15
 
 
 class DetectionModel(Protocol):
-    """The interface of a detection model. ``reach`` [m]: the horizontal range beyond which there are only false reads."""
+    """The interface of a detection model. ``reach`` [m]: the horizontal range. Beyond it all reads are false."""
 
     @property
     def reach(self) -> float: ...
 
     @property
     def uses_facing(self) -> bool:
-        """True if the read probability depends on the tag's facing."""
+        """True if the read probability depends on the direction of the tag's front."""
 
     @property
     def peak(self) -> float:
         """The largest read probability of the model."""
 
     def compiled(self) -> tuple[int, Sequence[float], Array]:
-        """The model for compiled code: its kind, its parameters, and the logits (H, F, NX, NY) of a grid, empty for other kinds."""
+        """Return the model for compiled code: kind, parameters, and the logits (H, F, NX, NY) of a grid, or empty."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class BeamModel:
 
     The read probability is ``p0 * sigmoid((r_max - r) / s_r) * exp(-(phi / sigma_phi)^2 / 2) * front``, with the
     distance r [m] and the bearing phi [rad] of the tag. ``front = behind + (1 - behind) * sigmoid((c + 0.25) / 0.15)``
-    depends on the cosine c of the angle between the tag's facing and the direction to the antenna (0 if unknown).
+    depends on the cosine c of the angle between the tag's front and the direction to the antenna (0 if unknown).
     ``behind``: the read probability from behind a tag, divided by that from its front.
     """
 
@@ -84,8 +84,8 @@ class BeamModel:
 class LogisticModel:
     """A detection model with a logit linear in :data:`FEATURES` up to the distance ``reach`` [m]. ``coefficients``
     (11,): one for each feature. The features depend on the horizontal distance r [m], w = 1 - cosine of the bearing,
-    the height difference z [m], and the cosine c of the angle between the tag's facing and the direction to the antenna
-    (0 if unknown)."""
+    the height difference z [m], and c. c is the cosine of the angle between the tag's front and the direction to the
+    antenna."""
 
     coefficients: Sequence[float]
     reach: float = 8.0
@@ -108,8 +108,8 @@ class GridModel:
 
     ``logits`` (H, F, NX, NY): the logits of the read probability at grid points that are ``cell`` [m] apart. The first
     point is at (``x0``, ``y0``). ``heights`` (H,) [m]: heights of the tag above the antenna, ascending and evenly
-    spaced. The F facings are evenly spaced cosines from -1 to 1 of the angle between the tag's facing and the direction
-    to the antenna. F is 1 if the facing is irrelevant. Interpolation is linear in height, otherwise cubic. The logit is
+    spaced. The F facings are evenly spaced cosines from -1 to 1 of the angle between the tag's front and the direction
+    to the antenna. F is 1 if this angle is irrelevant. Interpolation is linear in height, otherwise cubic. The logit is
     constant from the edge of the grid up to ``reach``.
     """
 
@@ -177,9 +177,9 @@ class Packed(NamedTuple):
 
 @dataclass(frozen=True)
 class RfidModel:
-    """All antennas and their detection models. ``false_read``: the read probability of a tag out of range. ``miss``: the
-    probability that a round misses any tag. ``tempering``: the exponent of the likelihood, below 1 if reads are
-    correlated. ``fixed``: True if the antennas are fixed, at poses in the world frame, and the tags are on the robot."""
+    """All antennas and their detection models. ``false_read``: the read probability of a tag out of range. ``miss``:
+    one minus the read probability of the best placed tag. ``tempering``: exponent of the likelihood, below 1 if reads
+    are correlated. ``fixed``: True if antennas are fixed in the world, and the tags are on the robot."""
 
     antennas: tuple[Antenna, ...]
     models: tuple[DetectionModel, ...]
@@ -189,7 +189,7 @@ class RfidModel:
     fixed: bool = False
 
     def packed(self) -> Packed:
-        """The model as a tuple of arrays for compiled code."""
+        """Return the model as a tuple of arrays for compiled code."""
         compiled = [model.compiled() for model in self.models]
         parameters = np.zeros((len(compiled), PARAMETERS))
         shapes = np.zeros((len(compiled), 5), dtype=np.int64)
@@ -225,8 +225,8 @@ def _probability(logit: float) -> float:
 
 
 def logits(model: DetectionModel, points: Array, facing: Array | float = 0.0) -> tuple[Array, Array]:
-    """The logits (N,) of tags at ``points`` (N, 3) [m] in the antenna's frame, and their gradient (N, 4) by x, y, z and
-    facing. ``facing`` (N,): the cosine of the angle between each tag's facing and the direction to the antenna."""
+    """Return the logits (N,) of tags at ``points`` (N, 3) [m] in the antenna's frame, and their gradient (N, 4) by x,
+    y, z, facing. ``facing`` (N,): the cosine of the angle between each tag's front and the direction to the antenna."""
     packed = RfidModel((Antenna(),), (model,)).packed()
     points = np.atleast_2d(np.asarray(points, dtype=float))
     facing = np.ascontiguousarray(np.broadcast_to(np.asarray(facing, dtype=float), len(points)))
@@ -236,8 +236,8 @@ def logits(model: DetectionModel, points: Array, facing: Array | float = 0.0) ->
 
 
 def probability(model: DetectionModel, points: Array, facing: Array | float = 0.0) -> Array:
-    """The read probabilities (N,), without false reads, of tags at ``points`` (N, 3) [m] in the antenna's frame.
-    ``facing`` (N,): the cosine of the angle between each tag's facing and the direction to the antenna."""
+    """Return the read probabilities (N,), without false reads, of tags at ``points`` (N, 3) [m] in the antenna's frame.
+    ``facing`` (N,): the cosine of the angle between each tag's front and the direction to the antenna."""
     return np.asarray(1.0 / (1.0 + np.exp(-logits(model, points, facing)[0])))
 
 
@@ -273,8 +273,8 @@ def _logits(
 def logit(
     kind: int, parameters: Array, shape: NDArray[np.int64], knots: Array, x: float, y: float, z: float, c: float
 ) -> tuple[float, float, float, float, float]:
-    """Return the logit of a tag at (x, y, z) in the antenna's frame with facing cosine c, and its four derivatives by
-    x, y, z and c."""
+    """Return the logit of a tag at (x, y, z) in the antenna's frame, and its four derivatives by x, y, z and c. ``c``:
+    the cosine of the angle between the tag's front and the direction to the antenna."""
     if kind == BEAM:
         return _beam(parameters, x, y, z, c)
     if kind == LOGISTIC:
@@ -305,15 +305,15 @@ def _beam(parameters: Array, x: float, y: float, z: float, c: float) -> tuple[fl
 
 @compiled(inline="always")
 def logistic_value(b: Array, r: float, w: float, height: float, c: float) -> float:
-    """The logit of a logistic model with coefficients ``b``. See :data:`FEATURES` and :class:`LogisticModel` for r, w and c."""
+    """Return the logit of a logistic model with coefficients ``b``. For r, w and c see :class:`LogisticModel`."""
     value = b[0] + r * (b[1] + b[2] * r) + w * (b[3] + b[4] * w + b[5] * r) + b[6] * abs(height)
     return float(value + c * (b[7] + b[8] * c + b[9] * r + b[10] * w))
 
 
 @compiled
 def _logistic_peak(b: Array, reach: float) -> float:
-    """The largest logit of a logistic model with coefficients ``b`` (11,), over all ranges up to ``reach`` [m],
-    bearings and facings, for tags at the antenna's height."""
+    """Return the largest logit of a logistic model with coefficients ``b`` (11,) over all bearings, tag directions, and
+    ranges up to ``reach`` [m]. The tags are at the antenna's height."""
     largest = -np.inf
     for r in np.linspace(0.0, reach, 81):
         for w in np.linspace(0.0, 2.0, 9):
@@ -338,7 +338,7 @@ def _logistic(b: Array, x: float, y: float, z: float, c: float) -> tuple[float, 
 
 @compiled
 def _slope(f: float) -> tuple[float, float, float, float]:
-    """The derivatives of :func:`cubic_weights` by ``f``."""
+    """Return the derivatives of :func:`cubic_weights` by ``f``."""
     return (
         (-1.5 * f + 2.0) * f - 0.5,
         (4.5 * f - 5.0) * f,

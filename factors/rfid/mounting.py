@@ -31,8 +31,8 @@ def placed(packed: Packed, antenna: int, pose: Array, offset: Array) -> tuple[fl
 
 @compiled
 def reach_of(packed: Packed, offsets: Array) -> float:
-    """Return the largest distance [m] from the reference pose at which a tag can be read, :data:`ANYWHERE` for fixed
-    antennas. ``offsets`` (K, 3): the robot's poses at the measurements, in the frame of the reference pose."""
+    """Return the largest distance [m] from the reference pose at which a tag can be read. It is :data:`ANYWHERE` for
+    fixed antennas. ``offsets`` (K, 3): the robot's poses at the measurements, in the frame of the reference pose."""
     if packed.fixed:
         return ANYWHERE
     offset = farthest = 0.0

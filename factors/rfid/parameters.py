@@ -27,15 +27,16 @@ MOST_CERTAIN = 0.99  # limit of the peak of a model, because a shift of the logi
 
 @compiled
 def rate_of(peak: float, shift: float) -> float:
-    """Return the factor ``rate`` of read probabilities for the parameter b of a detection model. It shifts the logit of
-    the model's largest probability ``peak`` by ``shift``, the value of b."""
+    """Return the factor of read probabilities that shifts the logit of the model's largest probability ``peak`` by
+    ``shift``. The shift is the parameter b of a detection model."""
     certain = min(peak, MOST_CERTAIN)
     return float(1.0 / (certain + (1.0 - certain) * math.exp(-shift)))
 
 
 @compiled
 def adjusted(packed: Packed, parameters: Array) -> Packed:
-    """Adjust detection models and mounting to ``parameters`` (Q,). ``packed``: the models before adjustment."""
+    """Apply ``parameters`` (Q,) (range and read rate of each model, yaws of antennas, time offset) to ``packed``, the
+    models with all parameters zero. Returns the adjusted models."""
     models, antennas = len(packed.reach), packed.antennas.copy()
     scale, reach, rate = np.empty(models), np.empty(models), np.empty(models)
     for m in range(models):

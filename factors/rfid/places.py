@@ -36,10 +36,10 @@ BY_ANTENNA = 7
 
 
 class RobotTables(NamedTuple):
-    """The responses of A antennas to a tag, by the tag's position in the robot frame. q is the read probability of one round.
+    """The responses of A antennas to a tag, by the tag's position in the robot frame.
 
-    A table has S x S cells of ``cell`` [m], for each of H heights and each of F facings of the tag. The last facing is
-    for tags with an unknown or irrelevant facing.
+    A table has S x S cells of ``cell`` [m], for each of H heights and each of F directions of the tag's front. The last
+    of the F tables is for tags with an unknown or irrelevant front. q is the read probability of one round.
     ``gain`` (A, H, F, S, S): log q - log(1 - q).
     ``missed`` (A, H, F, S, S): log(1 - q) minus its value out of reach.
     ``level`` (T,): the index of each tag's height. ``none`` (A, 2): log q and log(1 - q) out of reach.
@@ -97,7 +97,7 @@ class Antennas(NamedTuple):
 
 
 def antennas_of(packed: Packed, tables: Tables) -> Antennas:
-    """Return the detection models ``packed`` with their ``tables``, and with ``logs`` and ``reach`` computed from ``packed``."""
+    """Return the detection models ``packed`` with their ``tables``. The fields ``logs`` and ``reach`` are computed."""
     return Antennas(packed, tables, logs_of(packed), reach_of(packed, np.zeros((0, 3))))
 
 
@@ -108,7 +108,7 @@ def is_wide(poses: Array, reach: float) -> bool:
 
 
 def in_reach(points: Array, reach: float) -> float:
-    """The mean number of tags at ``points`` (T, 2) within ``reach`` [m] of a random pose in their bounding box."""
+    """Return the mean number of tags at ``points`` (T, 2) within ``reach`` [m] of a point in their bounding box."""
     if not len(points):
         return 0.0
     area = float(np.prod(np.ptp(points, axis=0) + 2.0 * reach))
@@ -116,11 +116,11 @@ def in_reach(points: Array, reach: float) -> float:
 
 
 def robot_tables(antennas: Antennas, heights: Array, finest: int = 1, facings: int = 0) -> RobotTables:
-    """Compute the tables of a model by the tag's position in the robot frame.
+    """Return tables of the read probability by the tag's position in the robot frame.
 
     ``heights`` (T,) [m]: heights of the tags. ``finest``: the size of cells and of height steps, as a multiple of their
-    size in the tables of ``antennas``. It is increased if the tables would be too large. ``facings``: number of facing
-    directions with a table. One more table is for tags with an unknown or irrelevant facing.
+    size in the tables of ``antennas``. It is increased if the tables would be too large. ``facings``: number of
+    directions of the tag's front with a table. One more table is for tags with an unknown or irrelevant front.
     """
     scale, size, (packed, tables, logs, reach) = finest, MOST + 1, antennas
     while size > MOST:
@@ -137,7 +137,7 @@ def robot_tables(antennas: Antennas, heights: Array, finest: int = 1, facings: i
 
 
 def miss_table(tables: RobotTables, scan: Scan, tempering: float, reach: float) -> MissTable:
-    """Return the log-likelihood that a scan did not read a tag, tabulated over the tag's position in the robot frame.
+    """Return the log-likelihood that the scan did not read a tag, tabulated over the tag's position in the robot frame.
     ``tempering``: exponent of the likelihood. ``reach`` [m]: the largest distance in the table."""
     total: Array32 = np.zeros((tables.missed.shape[1], *tables.missed.shape[3:]), dtype=np.float32)
     if not total.size:
@@ -155,12 +155,12 @@ def miss_table(tables: RobotTables, scan: Scan, tempering: float, reach: float) 
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """The likelihood of reads at poses anywhere in a map.
+    """The likelihood of RFID read counts at poses anywhere in a map.
 
     ``antennas``: the model and its tables. ``tables``: the tables by position in the robot frame, empty if the model
-    depends on the facing of tags. ``index``: the spatial index of the map's tags. In the order of the index,
-    ``points`` (T, 3) are the positions of the tags, ``normals`` (T, 2) their facings, and ``levels`` (A, T) the numbers
-    of their tables in ``antennas``.
+    depends on the direction of tags' fronts. ``index``: the spatial index of the map's tags. The other fields are in
+    the order of the index. ``points`` (T, 3): positions. ``normals`` (T, 2): unit vectors of the tags' fronts.
+    ``levels`` (A, T): the numbers of their tables in ``antennas``.
     """
 
     antennas: Antennas
@@ -173,7 +173,7 @@ class Places:
 
     @classmethod
     def of(cls, antennas: Antennas, of_map: MapTags, *, uses_facing: bool) -> Places:
-        """Make the likelihood for the tags of a map. ``uses_facing``: True if the model depends on the facing of tags."""
+        """Make the likelihood for tags of a map. ``uses_facing``: True if the model depends on the tags' fronts."""
         order = of_map.cells.order
         points, normals = np.ascontiguousarray(of_map.points[order]), np.ascontiguousarray(of_map.normals[order])
         tables = robot_tables(antennas, points[: 0 if uses_facing else len(points), 2])
@@ -182,7 +182,7 @@ class Places:
         )
 
     def work(self, counts: Counts) -> int:
-        """An estimate of the computing time for ``counts`` at one pose, relative to one tag that was not read."""
+        """Return the approximate computing time for ``counts`` at one pose, in evaluations of one unread tag."""
         near = in_reach(self.points[:, :2], self.antennas.reach)
         _, antennas, _, hits, *_ = counts
         if not self.tables.gain.size:
@@ -190,7 +190,7 @@ class Places:
         return PLACED + round(near) + 4 * int(np.count_nonzero(hits.any(axis=0)))
 
     def log_likelihood(self, poses: Array, counts: Counts, tempering: float) -> Array:
-        """The tempered log-likelihood (N,) of read ``counts`` at poses (N, 3)."""
+        """Return the tempered log-likelihood (N,) of read ``counts`` at poses (N, 3). ``tempering``: its exponent."""
         scan = self._scan(counts)
         missed = float(scan.rounds @ self.tables.none[scan.antennas, 1])
         out = np.full(len(poses), tempering * len(self.points) * missed)
@@ -233,9 +233,10 @@ def _log_likelihood(
     tempering: float,
     out: Array,
 ) -> None:
-    """Add the tempered log-likelihood of poses (N, 3), relative to that of poses without tags in reach, to ``out`` (N,).
+    """Add the tempered log-likelihood of poses (N, 3), relative to poses without tags in reach, to ``out`` (N,).
 
-    ``points`` (T, 3), ``normals`` (T, 2), ``levels`` (A, T): fields of :class:`Places`. ``missed``: the table of misses.
+    ``points`` (T, 3), ``normals`` (T, 2), ``levels`` (A, T): fields of :class:`Places`. ``missed``: the table of
+    misses.
     """
     far, tabled, reach = _far(tables, scan, tempering), tables.gain.size > 0, model.reach
     rows, base, size = (len(index.start) - 1) // index.columns, far.sum(), missed.surveyed.shape[1]
@@ -304,8 +305,8 @@ def _of_tag(
 
 @compiled(error_model="numpy", fastmath=FAST)
 def _far(tables: RobotTables, scan: Scan, tempering: float) -> Array:
-    """The tempered log-likelihood (W,) of the reads of each exceptional tag if the tag is out of reach, relative to the
-    log-likelihood of no reads."""
+    """Return the tempered log-likelihood (W,) of the reads of each exceptional tag if the tag is out of reach. It is
+    relative to the log-likelihood of no reads."""
     out = np.empty(len(scan.odds))
     for w in range(len(out)):
         own = 0.0

@@ -59,11 +59,11 @@ class TagReads:
     tags: Integers
 
     def moved(self, offset: Array) -> Self:
-        """Return the reads relative to a new reference pose. ``offset`` (3,): the old pose in the frame of the new."""
+        """Return the reads relative to a new reference pose. ``offset`` (3,): the old pose in the new pose's frame."""
         return replace(self, offsets=se2.compose(offset, self.offsets))
 
     def chosen(self, which: NDArray[np.bool_] | Integers) -> Self:
-        """The reads that the mask (R,) or indices ``which`` select."""
+        """Return the reads that the mask (R,) or indices ``which`` select."""
         return type(self)(*(getattr(self, f.name)[which] for f in fields(self)))
 
 
@@ -77,7 +77,7 @@ class RssiReads(TagReads):
 @dataclass(frozen=True, eq=False)
 class PhaseReads(TagReads):
     """R reads with phases. ``phase`` (R,) [rad]: the reported phases. ``frequency`` (R,) [Hz]: the carrier frequencies.
-    ``windows`` (R,): the number of each read's time window."""
+    ``windows`` (R,): the number of the time window of each read. Phases are compared within a window."""
 
     phase: Array
     frequency: Array
@@ -147,9 +147,9 @@ class StrengthProblem(NamedTuple):
 
 @dataclass(frozen=True)
 class PhaseModel:
-    """The model of the phases that ``antennas`` measure. ``kappa``: concentration of the von Mises density of twice the phase.
-    ``tempering``: exponent of the likelihood, below 1 for correlated reads. ``max_range`` [m]: the likelihood ignores more distant
-    tags, because of reflections. ``min_reads``: minimum number of reads of a group (antenna, tag, channel, time window)."""
+    """The model of the phases that ``antennas`` measure. ``kappa``: concentration of the von Mises density of twice the
+    phase. ``tempering``: exponent of the likelihood, below 1 for correlated reads. ``max_range`` [m]: more distant tags
+    are ignored, because of reflections. ``min_reads``: minimum of a group (antenna, tag, channel, window)."""
 
     antennas: tuple[Antenna, ...]
     kappa: float = 1.0
@@ -160,8 +160,9 @@ class PhaseModel:
 
 @dataclass(frozen=True)
 class RssiModel:
-    """The model of the signal strengths that ``antennas`` measure, linear in :data:`FEATURES` with ``coefficients`` (6,). ``sigma``
-    [dB], ``dof``: scale and degrees of freedom of the Student density of errors. ``tempering``: exponent of the likelihood."""
+    """The model of signal strengths at ``antennas``, linear in :data:`FEATURES` with ``coefficients`` (6,). ``sigma``
+    [dB], ``dof``: scale and degrees of freedom of the Student density of errors. ``tempering``: exponent of the
+    likelihood."""
 
     antennas: tuple[Antenna, ...]
     coefficients: Sequence[float]
@@ -182,10 +183,8 @@ class PhaseLikelihood:
         return mounting(self.model.antennas)
 
     def near(self, pose: Array, reads: PhaseReads) -> PhaseReads:
-        """Select the reads of tags within ``max_range`` for a robot at ``pose`` (3,), in groups of at least ``min_reads``.
-
-        Call this once per window, with the best known pose. A selection for each pose would make the likelihood discontinuous.
-        """
+        """Return the reads of tags within ``max_range`` of a robot at ``pose`` (3,), in groups of ``min_reads`` or
+        more. Call this once per window. A selection for each pose would make the likelihood discontinuous."""
         at = se2.compose(np.asarray(pose, dtype=float), reads.offsets)
         places = self._antennas[reads.antennas]
         points = self.tags.points[reads.tags]
@@ -194,21 +193,21 @@ class PhaseLikelihood:
         return nearby.chosen(np.bincount(nearby.groups)[nearby.groups] >= self.model.min_reads)
 
     def problem(self, reads: PhaseReads) -> PhaseProblem:
-        """Combine model, map and ``reads`` for compiled code."""
+        """Return model, map and ``reads`` for compiled code."""
         return PhaseProblem(self._antennas, self.tags.points, reads.ordered, self.model.tempering * self.model.kappa)
 
     def score(self, poses: Array, reads: PhaseReads) -> Score:
-        """The tempered likelihood of ``reads`` at poses (N, 3), with derivatives."""
+        """Return the tempered likelihood of ``reads`` at poses (N, 3), with derivatives."""
         return Score.of_signals(*phase_scores(self.problem(reads), _rows(poses), True))
 
     def log_likelihood(self, poses: Array, reads: PhaseReads) -> Array:
-        """The tempered log-likelihood (N,) of ``reads`` at poses (N, 3), without derivatives, for particles."""
+        """Return the tempered log-likelihood (N,) of ``reads`` at poses (N, 3), without derivatives, for particles."""
         return -phase_scores(self.problem(reads), _rows(poses), False)[0]
 
 
 @dataclass(frozen=True, eq=False)
 class RssiLikelihood:
-    """The likelihood of signal strengths as a function of the robot's pose in a map of tags, divided by its value for
+    """The likelihood of signal strengths as a function of the robot's pose in a map of tags. It is relative to
     residuals of zero."""
 
     model: RssiModel
@@ -221,15 +220,15 @@ class RssiLikelihood:
         return *arrays, float(m.sigma), float(m.dof), float(m.tempering)
 
     def problem(self, reads: RssiReads) -> StrengthProblem:
-        """Combine model, map and ``reads`` for compiled code."""
+        """Return model, map and ``reads`` for compiled code."""
         return StrengthProblem(*self._arrays, reads.offsets, reads.antennas, reads.tags, reads.rssi)
 
     def score(self, poses: Array, reads: RssiReads) -> Score:
-        """The tempered likelihood of ``reads`` at poses (N, 3), with derivatives."""
+        """Return the tempered likelihood of ``reads`` at poses (N, 3), with derivatives."""
         return Score.of_signals(*strength_scores(self.problem(reads), _rows(poses), True))
 
     def log_likelihood(self, poses: Array, reads: RssiReads) -> Array:
-        """The tempered log-likelihood (N,) of ``reads`` at poses (N, 3), without derivatives, for particles."""
+        """Return the tempered log-likelihood (N,) of ``reads`` at poses (N, 3), without derivatives, for particles."""
         return -strength_scores(self.problem(reads), _rows(poses), False)[0]
 
 
@@ -239,7 +238,7 @@ def _rows(poses: Array) -> Array:
 
 
 def mounting(antennas: Sequence[Antenna]) -> Array:
-    """The positions and boresights (A, 6) of antennas in the robot frame: x, y, z and a unit vector."""
+    """Return the positions and boresights (A, 6) of antennas in the robot frame: x, y, z and a unit vector."""
     rows = [
         (a.x, a.y, a.z, math.cos(a.yaw) * math.cos(a.pitch), math.sin(a.yaw) * math.cos(a.pitch), math.sin(a.pitch))
         for a in antennas
@@ -248,22 +247,22 @@ def mounting(antennas: Sequence[Antenna]) -> Array:
 
 
 def features(antennas: Sequence[Antenna], tags: TagArray, pose: Array, reads: RssiReads) -> Array:
-    """The :data:`FEATURES` (R, 6) of each read by ``antennas`` of ``tags`` on a robot at ``pose`` (3,), to fit the coefficients."""
+    """Return the :data:`FEATURES` (R, 6) of R reads by a robot at ``pose`` (3,), to fit :class:`RssiModel`."""
     pose, rows = np.asarray(pose, dtype=float), mounting(antennas)
     return _all_features(rows, tags.points, tags.normals, pose, reads.offsets, reads.antennas, reads.tags)
 
 
 @compiled(inline="always")
 def _on_robot(offset: Array, x: float, y: float) -> tuple[float, float]:
-    """Transform (x, y) from the robot frame to the reference frame, in which the robot is at ``offset`` (3,)."""
+    """Transform (x, y) from the robot frame to the frame of ``offset`` (3,), the robot's pose."""
     c, s = math.cos(offset[2]), math.sin(offset[2])
     return offset[0] + c * x - s * y, offset[1] + s * x + c * y
 
 
 @compiled
 def phase_scores(problem: PhaseProblem, poses: Array, derivatives: bool) -> tuple[Array, Array, Array]:
-    """The tempered negative log-likelihood (N,) of phases at poses (N, 3), its gradient (N, 3) and its information (N,
-    3, 3). The last two are empty if ``derivatives`` is False."""
+    """Return the tempered negative log-likelihood (N,) of phases at poses (N, 3), its gradient (N, 3) and its Fisher
+    information (N, 3, 3). The last two are empty if ``derivatives`` is False."""
     antennas, points, reads, factor = problem
     count, each = len(poses) if derivatives else 0, len(reads.doubled)
     nll, gradient, information = np.zeros(len(poses)), np.zeros((count, 3)), np.zeros((count, 3, 3))
@@ -299,7 +298,7 @@ def phase_scores(problem: PhaseProblem, poses: Array, derivatives: bool) -> tupl
 
 @compiled
 def _add_group(psi: Array, by: Array, offset: float, gradient: Array, information: Array) -> None:
-    """Add the derivatives of R reads in a group to ``gradient`` (3,) and ``information`` (3, 3), for a kappa of 1.
+    """Add the derivatives of R reads in a group, with a kappa of 1, to ``gradient`` (3,) and ``information`` (3, 3).
     ``psi`` (R,): phase errors. ``by`` (R, 3): their derivatives by the pose. ``offset``: the mean phase error."""
     total, mean = 0.0, np.zeros(3)
     for r in range(len(psi)):
@@ -319,7 +318,7 @@ def _add_group(psi: Array, by: Array, offset: float, gradient: Array, informatio
 
 @compiled(inline="always")
 def _mounted(antenna: Array, offset: Array) -> tuple[float, float, float, float]:
-    """An antenna's x, y and horizontal boresight (x, y) in the reference frame. The robot is at ``offset`` (3,)."""
+    """Return an antenna's x, y and horizontal boresight (x, y) in the frame of ``offset`` (3,), the robot's pose."""
     x, y = _on_robot(offset, antenna[0], antenna[1])
     c, s = math.cos(offset[2]), math.sin(offset[2])
     return x, y, c * antenna[3] - s * antenna[4], s * antenna[3] + c * antenna[4]
@@ -362,8 +361,8 @@ def _all_features(
 
 @compiled
 def strength_scores(problem: StrengthProblem, poses: Array, derivatives: bool) -> tuple[Array, Array, Array]:
-    """The tempered negative log-likelihood (N,) of signal strengths at poses (N, 3), its gradient (N, 3) and its
-    information (N, 3, 3). The last two are empty if ``derivatives`` is False."""
+    """Return the tempered negative log-likelihood (N,) of signal strengths at poses (N, 3), its gradient (N, 3) and its
+    Fisher information (N, 3, 3). The last two are empty if ``derivatives`` is False."""
     antennas, points, normals, b, sigma, dof, factor, offsets, which, tags, rssi = problem
     count = len(poses) if derivatives else 0
     nll, gradient, information = np.zeros(len(poses)), np.zeros((count, 3)), np.zeros((count, 3, 3))

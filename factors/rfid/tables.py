@@ -65,15 +65,16 @@ class Tables(NamedTuple):
 
 
 def logs_of(packed: Packed) -> Array32:
-    """The logarithms (M, Z, 2) of read probability and miss probability, of M adjusted models at the logits of :class:`Tables`."""
+    """Return the logarithms (M, Z, 2) of read and miss probability of M models at the Z logits of :class:`Tables`."""
     q = packed.false_read + packed.span * packed.rate[:, None] / (1.0 + np.exp(-_LOGITS))
     q = np.clip(q, 1e-12, 1.0 - 1e-12)
     return np.asarray(np.log(np.stack((q, 1.0 - q), axis=-1)), dtype=np.float32)
 
 
 def make_tables(model: RfidModel, packed: Packed, heights: Array) -> Tables:
-    """Compute the tables of a model for tags at ``heights`` (T,) [m]: one for each detection model, pitch of the antenna, and
-    height of tags above the antenna. ``packed``: the model for compiled code. Logistic models need no table."""
+    """Return tables of a model for tags at ``heights`` (T,) [m]. There is one for each detection model, pitch of the
+    antenna, and height of tags above the antenna. ``packed``: the model for compiled code. Logistic models need no
+    table."""
     sigmoids = 1.0 / (1.0 + np.exp(-_LOGITS))
     numbers: dict[tuple[int, float, int], int] = {}
     level = np.zeros((len(model.antennas), len(heights)), dtype=np.int64)
@@ -121,7 +122,7 @@ def make_tables(model: RfidModel, packed: Packed, heights: Array) -> Tables:
 
 
 def _blocks(table: NDArray[np.uint16]) -> NDArray[np.uint16]:
-    """The largest element, over all facings, in each block of a table (F, NX, NX)."""
+    """Return the largest element, over all facings, in each block of a table (F, NX, NX)."""
     begins = np.arange(0, table.shape[1], COARSE)
     highest = np.maximum.reduceat(table.max(axis=0), begins, axis=0)
     return np.asarray(np.maximum.reduceat(highest, begins, axis=1))
@@ -129,7 +130,7 @@ def _blocks(table: NDArray[np.uint16]) -> NDArray[np.uint16]:
 
 @compiled
 def logit_row(z: float) -> int:
-    """The index of the logit ``z`` in ``sigmoids`` of :class:`Tables`."""
+    """Return the index of the logit ``z`` in ``sigmoids`` of :class:`Tables`."""
     return int((min(max(z, NEGLIGIBLE_LOGIT), -NEGLIGIBLE_LOGIT) - NEGLIGIBLE_LOGIT) / STEP + 0.5)
 
 
@@ -175,11 +176,11 @@ def _fill(packed: Packed, antenna: int, height: float, half: int, table: NDArray
 def row_of(
     packed: Packed, tables: Tables, antenna: int, level: int, along: float, across: float, height: float, facing: float
 ) -> int:
-    """The index in ``sigmoids`` of :class:`Tables` for the logit of a tag in reach of an antenna.
+    """Return the index in ``sigmoids`` of :class:`Tables` for the logit of a tag in reach of an antenna.
 
     ``level``: the number of the table. ``along``, ``across``: the tag's position along and across the antenna's
     heading, divided by the range scale of the model. ``height`` [m]: the tag's height above the floor. ``facing``: the
-    cosine of the angle between the tag's facing and the direction to the antenna.
+    cosine of the angle between the tag's front and the direction to the antenna.
     """
     m = packed.which[antenna]
     if packed.kinds[m] == LOGISTIC:
@@ -215,12 +216,12 @@ def relevant(
 ) -> NDArray[np.bool_]:
     """Return a mask (K, T), True if a tag in a measurement noticeably changes the likelihood of any particle.
 
-    ``poses`` (N, 3), ``parameters`` (N or 1, Q): poses and parameters of the particles. ``packed``: models adjusted to
-    the first row of ``parameters``. ``near`` (T,): a mask of tags in reach. ``measured``, ``tags``: the reads of K
-    measurements and the data of T tags.
+    ``poses`` (N, 3), ``parameters`` (N or 1, Q): poses and parameters of the particles. ``packed``: models with the
+    first row of ``parameters`` applied. ``near`` (T,): a mask of tags in reach. ``measured``: offsets, antennas and
+    rounds of K measurements. ``tags``: points, normals, table numbers and hits of T tags.
 
-    The mask is True for near tags that were read, and for near tags with a relevant read probability in the blocks of
-    the tables. All tags on a robot are relevant.
+    The mask is True for near tags that were read, and for near tags with a relevant read probability. All tags on a
+    robot are relevant.
     """
     offsets, antennas, rounds = measured
     points, _, levels, hits = tags
@@ -254,7 +255,7 @@ def relevant(
 
 @compiled
 def _largest(tables: Tables, level: int, along: float, across: float, radius: float) -> float:
-    """An upper bound of the sigmoids of the table ``level`` within ``radius`` [m] of the position (``along``,
+    """Return an upper bound of the sigmoids of the table ``level`` within ``radius`` [m] of the position (``along``,
     ``across``). Beyond its edge a table continues with the values at the edge."""
     half, largest = tables.half[level], 0.0
     last, reach = 2 * half, radius / CELL + 1.0
@@ -267,5 +268,5 @@ def _largest(tables: Tables, level: int, along: float, across: float, radius: fl
 
 @compiled(inline="always")
 def _block(place: float, last: int) -> int:
-    """The number of the block that contains the cell ``place``, clipped to the range from 0 to ``last``."""
+    """Return the number of the block that contains the cell ``place``, clipped to the range from 0 to ``last``."""
     return int(min(max(place, 0.0), last)) // COARSE

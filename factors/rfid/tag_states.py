@@ -56,7 +56,7 @@ COLUMNS = {"dead": slice(DEAD, WEAK), "weak": slice(WEAK, MOVED), "moved": slice
 
 
 def displacements() -> Array:
-    """The possible displacements (K, 2) [m] of moved tags: a grid in a disc, without the centre."""
+    """Return the possible displacements (K, 2) [m] of moved tags: a grid in a disc, without the centre."""
     steps = np.arange(-FARTHEST, FARTHEST + 0.5 * PITCH, PITCH)
     grid = np.stack(np.meshgrid(steps, steps, indexing="ij"), axis=-1).reshape(-1, 2)
     distance = np.hypot(*grid.T)
@@ -64,15 +64,16 @@ def displacements() -> Array:
 
 
 def hypotheses() -> Array:
-    """Return the S states (S, 4) of a tag that is not dead: as in the map, each kind of weak, each displacement. A row
-    has the displacement (2) [m], and the changes of the parameters a and b of :mod:`factors.rfid.parameters`."""
+    """Return the S states (S, 4) of a tag that is not dead: as in the map, weak in several degrees, or moved by each of
+    several displacements. A row has the displacement (2) [m], and the changes of the parameters a and b of
+    :mod:`factors.rfid.parameters`."""
     weak, moves = WEAKNESSES[:, :2], displacements()
     still, usual = np.zeros_like(weak), np.zeros_like(moves)
     return np.concatenate((np.zeros((1, 4)), np.hstack((still, weak)), np.hstack((moves, usual))))
 
 
 def _log(probability: float) -> float:
-    """The logarithm of a probability, ``-inf`` for zero."""
+    """Return the logarithm of a probability, ``-inf`` for zero."""
     return math.log(probability) if probability > 0.0 else -math.inf
 
 
@@ -108,8 +109,8 @@ class TagStates:
 
     @property
     def suspects(self) -> dict[str, dict[int, float]]:
-        """The tags that are dead, weak or moved with a probability above :data:`BELIEVED`. For each of the three
-        states, a dictionary from the index of a tag to the probability."""
+        """The tags that are dead, weak or moved with a probability above :data:`BELIEVED`. The keys are "dead", "weak"
+        and "moved". Each value is a dictionary from the index of a tag to the probability."""
         doubtful, suspects = self.doubtful, dict[str, dict[int, float]]()
         weights = self._weights[doubtful]
         shares = np.exp(weights - weights.max(axis=1, keepdims=True))
@@ -121,7 +122,7 @@ class TagStates:
         return suspects
 
     def were_read(self, tags: Integers) -> NDArray[np.bool_]:
-        """A mask (U,) of the ``tags`` (U,) that have been read at any time, and are therefore not dead."""
+        """Return a mask (U,) of the ``tags`` (U,) that have been read at any time, and are therefore not dead."""
         return np.asarray(self._weights[tags, DEAD] == -np.inf)
 
     def hear(self, t: float, tags: Integers) -> None:
@@ -133,8 +134,8 @@ class TagStates:
             self.last_read = max(self.last_read, t)
 
     def expect(self, tags: Integers, evidence: Array) -> Array:
-        """Return the log-likelihood (U,) of a scan for ``tags`` (U,) that are weak, moved or dead. This is the field
-        ``elsewhere`` of :class:`~factors.rfid.detection.TagReadCounts`.
+        """Return the log-likelihood (U,) of a scan for ``tags`` (U,), under the condition that each is weak, moved or
+        dead. This is the field ``elsewhere`` of :class:`~factors.rfid.detection.TagReadCounts`.
 
         ``evidence`` (U, S): the log-likelihood of each tag's reads and misses for each of the ``hypotheses``, relative
         to the log-likelihood that a tag out of range is never read.
@@ -142,7 +143,7 @@ class TagStates:
         return _expected(self._weights, tags, evidence)
 
     def learn(self, t: float, tags: Integers, evidence: Array) -> None:
-        """Update the filters of ``tags`` (U,) by the ``evidence`` (U, S) of a scan at time ``t`` [s]. See :meth:`expect`."""
+        """Update the filters of ``tags`` (U,) by a scan at ``t`` [s]. ``evidence`` (U, S): as in :meth:`expect`."""
         if len(tags):
             self._evidence.append((t, tags, evidence.astype(np.float32)))
             self._add(tags, self._evidence[-1][2], 1.0)
@@ -150,8 +151,9 @@ class TagStates:
             self._evidence.popleft()
 
     def forget(self, since: float) -> None:
-        """Undo :meth:`learn` for all scans since the time ``since`` [s] that are not older than :data:`KEPT`. Call this
-        if the robot's pose was wrong in these scans, or before they are processed again."""
+        """Undo :meth:`learn` for all scans since the time ``since`` [s], except those more than :data:`KEPT` seconds
+        before the newest. Call this if the robot's pose was wrong in these scans, or before they are processed
+        again."""
         kept: deque[tuple[float, Integers, NDArray[np.float32]]] = deque()
         for row in self._evidence:
             if row[0] < since:
@@ -179,8 +181,8 @@ class TagStates:
 
 @compiled
 def sigma_poses(pose: Array, covariance: Array, width: float) -> Array:
-    """Sigma points (6, 3) of a Gaussian of poses: ``pose`` (3,) moved by plus and minus ``width`` times each column of
-    the lower root of the body-frame ``covariance`` (3, 3)."""
+    """Return the sigma points (6, 3) of a Gaussian of poses. They are ``pose`` (3,) moved by plus and minus ``width``
+    times each column of the lower Cholesky factor of its body-frame ``covariance`` (3, 3)."""
     out = np.empty((6, 3))
     root, exists = cholesky(covariance)
     if not exists:  # rounding made the covariance singular: ignore correlations
@@ -207,7 +209,7 @@ def displaced(
     tempering: float,
     parameters: Array,
 ) -> tuple[Integers, Array, NDArray[np.bool_]]:
-    """The compiled part of :meth:`factors.rfid.detection.RfidLikelihood.displaced`, with the same results."""
+    """Compute the results of :meth:`factors.rfid.detection.RfidLikelihood.displaced` in compiled code."""
     placed = adjusted(packed, parameters)
     measured = delayed(counts[0], counts[8], placed.delay), counts[1], counts[2]
     reach = margin + reach_of(placed, measured[0])
@@ -258,7 +260,7 @@ def displaced(
 
 @compiled
 def _log_sum(weights: Array, evidence: Array) -> float:
-    """The logarithm of the sum of the exponentials of ``weights`` + ``evidence`` (N,)."""
+    """Return the logarithm of the sum of the exponentials of ``weights`` + ``evidence`` (N,)."""
     most = -math.inf
     for k in range(len(weights)):
         most = max(most, weights[k] + evidence[k])
@@ -272,7 +274,7 @@ def _log_sum(weights: Array, evidence: Array) -> float:
 
 @compiled
 def _odds(weights: Array) -> float:
-    """The log-odds that a tag is weak, moved or dead. ``weights``: the log-probabilities of its states."""
+    """Return the log-odds that a tag is weak, moved or dead. ``weights``: the log-probabilities of its states."""
     return float(_log_sum(weights[DEAD:], np.zeros(len(weights) - DEAD)) - weights[0])
 
 
@@ -317,7 +319,7 @@ def _learn(weights: Array, odds: Array, tags: Integers, evidence: NDArray[np.flo
 
 @compiled
 def _all_odds(weights: Array) -> Array:
-    """The log-odds (T,) that each tag is weak, moved or dead. ``weights`` (T, W): the log-probabilities of their states."""
+    """Return the log-odds (T,) that each tag is weak, moved or dead. ``weights`` (T, W): logs of probabilities."""
     return np.array([_odds(of_tag) for of_tag in weights])
 
 

@@ -33,11 +33,9 @@ _MANTISSA, _HALF = 0x000FFFFFFFFFFFFF, 0x3FE0000000000000  # bits of a float: ma
 def log_likelihood(
     packed: Packed, tables: Tables, of_map: MapTags, counts: Counts, poses: Array, tempering: float, parameters: Array
 ) -> Array:
-    """The tempered log-likelihood (N,) of read ``counts`` at poses (N, 3).
-
-    ``packed``: models before adjustment. ``of_map``: the map's tags. ``parameters`` (N or 1, Q): the parameters of each
-    pose (:mod:`factors.rfid.parameters`), or of all poses.
-    """
+    """Return the tempered log-likelihood (N,) of read ``counts`` at poses (N, 3). ``packed``, ``tables``: models with
+    all parameters zero. ``of_map``: the map's tags. ``tempering``: the exponent. ``parameters`` (N or 1, Q): the
+    parameters of each pose, or of all poses, see :mod:`factors.rfid.parameters`."""
     first_row = adjusted(packed, parameters[0])
     measured = delayed(counts[0], counts[8], first_row.delay), counts[1], counts[2]
     widest = parameters[0].copy()
@@ -92,8 +90,8 @@ def log_likelihood(
 
 @compiled
 def mixed(own: float, odds: float, elsewhere: float) -> float:
-    """The log-likelihood of a tag that may be weak, moved or dead. ``own``: the log-likelihood if it is none of these.
-    ``odds``, ``elsewhere``: of :class:`~factors.rfid.detection.TagReadCounts`."""
+    """Return the log-likelihood of a tag that may be weak, moved or dead. ``own``: the log-likelihood if it is none of
+    these. ``odds``, ``elsewhere``: of :class:`~factors.rfid.detection.TagReadCounts`."""
     if odds == -np.inf or elsewhere == -np.inf:
         return own
     displaced = odds + elsewhere
@@ -105,8 +103,8 @@ def mixed(own: float, odds: float, elsewhere: float) -> float:
 
 @compiled
 def tags_of_tables(tables: Tables, near: NearTags) -> Tags:
-    """The data of C near tags for :func:`weigh_tag`: points (C, 3), normals (C, 2), the numbers (A, C) of the tables of
-    each antenna and tag, and the numbers of reads (K, C)."""
+    """Return the data of C near tags for :func:`weigh_tag`: points (C, 3), normals (C, 2), the numbers (A, C) of the
+    tables of each antenna and tag, and the numbers of reads (K, C)."""
     levels = np.empty((len(tables.level), len(near.tags)), np.int64)
     for a in range(len(levels)):
         for u in range(len(near.tags)):
@@ -116,7 +114,7 @@ def tags_of_tables(tables: Tables, near: NearTags) -> Tags:
 
 @compiled
 def mark_near(poses: Array, tags: Tags, reach: float, out: NDArray[np.bool_]) -> None:
-    """Write a mask of tags into ``out`` (T,): True if a tag is within ``reach`` [m] of the bounding box of the poses (N, 3)."""
+    """Write a mask into ``out`` (T,): True if a tag is within ``reach`` [m] of the bounding box of the poses (N, 3)."""
     points = tags[0]
     low_x = high_x = poses[0, 0]
     low_y = high_y = poses[0, 1]
@@ -133,11 +131,11 @@ def mark_near(poses: Array, tags: Tags, reach: float, out: NDArray[np.bool_]) ->
 def place_antennas(
     packed: Packed, poses: Array, measured: Measured, parameters: Array, placed: Array, at: Array, models: Array
 ) -> None:
-    """Compute the antennas' poses and the models' adjustments for N robot poses.
+    """Write the antennas' poses and the models' calibration for N robot poses into arrays.
 
-    ``poses`` (N, 3): the robot poses. ``parameters`` (N or 1, Q): the parameters of each pose, or of all poses.
-    ``placed`` (Q,): the parameters to which ``packed`` is adjusted. Their yaws and the yaws in ``parameters`` must not
-    differ by more than 0.5 rad.
+    ``packed``: models with the parameters ``placed`` (Q,) applied. ``poses`` (N, 3): the robot poses. ``measured``:
+    offsets, antennas and rounds of K measurements. ``parameters`` (N or 1, Q): the parameters of each pose, or of all
+    poses. Their yaws must not differ from the yaws in ``placed`` by more than 0.5 rad.
     ``at`` (K, 4, N): output, x, y, cosine and sine of the heading of each measurement's antenna in the frame of the
     tags (:mod:`factors.rfid.mounting`).
     ``models`` (M, 2, N): output, the inverse range scale, and rate times span of :class:`~factors.rfid.model.Packed`.
@@ -178,7 +176,7 @@ def place_antennas(
 
 @compiled
 def _silence(packed: Packed, rounds: Integers) -> float:
-    """The log-likelihood that a tag out of reach is not read in any of ``rounds`` (K,)."""
+    """Return the log-likelihood that a tag out of reach is not read in any of ``rounds`` (K,)."""
     count = 0
     for k in range(len(rounds)):
         count += rounds[k]
@@ -200,10 +198,11 @@ def weigh_tag(
     product: Array,
     room: Array,
 ) -> None:
-    """Write the log-likelihood of tag number ``t`` at N poses into ``own`` (N,), relative to that of a tag out of reach.
+    """Write the log-likelihood of tag number ``t`` at N poses into ``own`` (N,), relative to that of a tag out of
+    reach.
 
-    ``at``, ``models``, ``measured``: as in :func:`place_antennas`. ``count``: N. ``matters`` (K,): a mask of
-    measurements to evaluate. ``product`` (N,), ``room`` (N,): working memory.
+    ``at``, ``models``, ``measured``: as in :func:`place_antennas`. ``tags``: from :func:`tags_of_tables`. ``count``: N.
+    ``matters`` (K,): a mask of measurements to evaluate. ``product``, ``room`` (N,): working memory.
     """
     points, normals, levels, hits = tags
     _, antennas, rounds = measured
@@ -243,8 +242,9 @@ def _chances(
     normal: Array,
     chance: Array,
 ) -> None:
-    """Write the sigmoids of the logits of one tag for one antenna at N poses into ``chance`` (N,). ``at`` (4, N): the antenna's
-    poses. ``unit`` (N,): the inverse range scale of each. ``level``: the table. ``point``, ``normal``: position and facing."""
+    """Write the sigmoids of the logits of one tag for one antenna at N poses into ``chance`` (N,). ``at`` (4, N): the
+    antenna's poses. ``unit`` (N,): inverse range scales. ``level``: the table. ``point``, ``normal``: the tag's
+    position and front."""
     x, y, c, s = at[0], at[1], at[2], at[3]
     tx, ty, height, nx, ny = point[0], point[1], point[2], normal[0], normal[1]
     if packed.kinds[packed.which[antenna]] == LOGISTIC or tables.facings[level] > 1:
@@ -276,14 +276,15 @@ def _chances(
 
 @compiled(inline="always")
 def _floored(packed: Packed, rate: float, chance: float) -> float:
-    """The read probability from the sigmoid ``chance`` of a logit, including false reads, at least :data:`LEAST` and at
-    most 1 - :data:`LEAST`. ``rate``: the factor of the probability, from ``models`` of :func:`place_antennas`."""
+    """Return the read probability for the sigmoid ``chance``, with false reads, from :data:`LEAST` to 1 -
+    :data:`LEAST`. ``rate``: the factor of the probability, from ``models`` of :func:`place_antennas`."""
     return float(min(max(packed.false_read + rate * chance, LEAST), 1.0 - LEAST))
 
 
 @compiled(fastmath=True)
 def _add_logs(values: Array, count: int, out: Array) -> None:
-    """Add the logarithms of positive ``values`` (N,) to ``out`` (N,), with an error of at most 1e-10. Sets ``values`` to 1."""
+    """Add the logarithms of ``values`` (N,) > 0 to ``out`` (N,), with an error of at most 1e-10. Sets ``values`` to
+    1."""
     room = np.empty(count)
     bits, mantissas = values.view(np.int64), room.view(np.int64)
     for n in range(count):
@@ -301,7 +302,7 @@ def _add_logs(values: Array, count: int, out: Array) -> None:
 
 @compiled(inline="always")
 def fast_exp(x: float) -> float:
-    """The exponential of x, for x from -20 to 0, with an error of at most 1e-8."""
+    """Return the exponential of x, for x from -20 to 0, with an error of at most 1e-8."""
     y = x / 64.0
     e = 1.0 + y * (
         1.0 + y / 2 * (1.0 + y / 3 * (1.0 + y / 4 * (1.0 + y / 5 * (1.0 + y / 6 * (1.0 + y / 7 * (1.0 + y / 8))))))
