@@ -38,11 +38,11 @@ CHUNK = 500  # number of points in one computation of covariances, to limit the 
 class Bundle:
     """The result of a bundle adjustment with F cameras, T points and N observations.
 
-    ``model``: the camera's calibration, adjusted if that was requested. ``cameras``: the adjusted poses.
-    ``tracks``: the observations without outliers. ``points`` (T, 3) [m]: the adjusted positions of their points.
-    ``old`` (T,): the index of each point in the input. ``errors`` (N, 2) [px]: the residuals, predicted minus measured.
-    ``camera_covariances`` (F, 6, 6): of perturbations in the cameras' own frames, rotation first.
-    ``point_covariances`` (T, 3, 3) [m^2]: of the points. The uncertainty of the calibration is not included.
+    ``model``: the camera's calibration, adjusted if that was requested. ``cameras``: the adjusted poses. ``tracks``:
+    the observations without outliers. ``points`` (T, 3) [m]: the adjusted positions of their points. ``old`` (T,): the
+    index of each point in the input. ``errors`` (N, 2) [px]: the residuals, predicted minus measured.
+    ``camera_covariances`` (F, 6, 6): of perturbations in the cameras' own frames, rotation first. ``point_covariances``
+    (T, 3, 3) [m^2]: of the points. Limitation: the uncertainty of the calibration is not included.
     """
 
     model: CameraModel
@@ -66,12 +66,12 @@ def adjust(
     lens: bool = False,
     progress: Callable[[float], None] = lambda _: None,
 ) -> Bundle:
-    """Adjust points and camera poses (bundle adjustment), and optionally the camera's calibration.
+    """Return the result of a bundle adjustment of points and camera poses, and optionally of the camera's calibration.
 
     ``cameras``, ``covariances`` (F, 6, 6): the prior poses and their covariances, in the cameras' own frames, rotation
-    first. ``tracks``: the observations. ``points`` (T, 3): the initial positions. ``focal``: estimate the focal lengths
-    too. ``lens``: estimate the focal lengths, the principal point and the distortion (Brown's model) too. ``progress``:
-    is called with the fraction done. Raises RuntimeError if the graph cannot be solved.
+    first. ``tracks``: the observations. ``points`` (T, 3) [m]: the initial positions. ``focal``: True to estimate the
+    focal lengths too. ``lens``: True to estimate the focal lengths, the principal point and the distortion (Brown's
+    model) too. ``progress``: is called with the fraction done. Raises RuntimeError if the graph cannot be solved.
     """
     old = np.arange(len(points))
     fixed = gtsam.NonlinearFactorGraph()
@@ -138,7 +138,7 @@ def pose3(position: Array, rotation: Array) -> gtsam.Pose3:
 
 
 def robust_noise(model: CameraModel) -> Any:
-    """Return GTSAM's noise model of a pixel, with a Huber loss."""
+    """Return GTSAM's noise model of a pixel measurement, with a Huber loss."""
     huber = gtsam.noiseModel.mEstimator.Huber.Create(model.robust)
     return gtsam.noiseModel.Robust.Create(huber, gtsam.noiseModel.Isotropic.Sigma(2, model.sigma))
 

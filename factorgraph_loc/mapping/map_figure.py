@@ -22,7 +22,7 @@ LABEL = 4  # last characters of a tag's EPC that are shown
 
 
 def tag_figure(log: str, made: MadeTags) -> Figure:
-    """Plot a new map of tags, with the given map and the trajectory, as :func:`figure` does for landmarks.
+    """Plot a new map of tags, with the given map and the trajectory. Returns the figure.
 
     The plot also has the candidate positions of ambiguous tags, and the given tags that were not located. Labels are
     the last characters of EPCs. ``log``: the name of the log. ``made``: the new map.
@@ -49,7 +49,7 @@ def dropped_figure(
     poses: Array,
     walls: Sequence[tuple[float, ...]] = (),
 ) -> Figure:
-    """Plot a map of tags. The tags that are probably dead are crossed out.
+    """Plot a map of tags with crosses over tags that are probably dead. Returns the figure.
 
     ``places``: the position (2,) of each tag by EPC. ``dead``: the EPCs of the dead tags, with the probability that the
     tag is dead. ``poses`` (N, 3): the trajectory. ``walls``: (x1, y1, x2, y2) of each wall.
@@ -67,7 +67,7 @@ def dropped_figure(
 
 
 def figure(log: str, made: LandmarkMap, poses: Array, label: int = 0) -> Figure:
-    """Plot a new map of landmarks with 2-sigma ellipses, the landmarks of the given map, and the trajectory.
+    """Plot a new map of landmarks with 2-sigma ellipses, the given map and the trajectory. Returns the figure.
 
     ``log``: the name of the log. ``made``: the new map. ``poses`` (N, 3): the trajectory in its frame. ``label``:
     landmarks are labelled with this many last characters of their name, or with the whole name if it is 0.
@@ -97,7 +97,7 @@ def figure(log: str, made: LandmarkMap, poses: Array, label: int = 0) -> Figure:
 
 
 def point_figure(log: str, points: PointMap, cameras: Array, walls: Sequence[tuple[float, ...]] = ()) -> Figure:
-    """Plot a map of points from above, coloured by height.
+    """Plot a map of points from above, coloured by height. Returns the figure.
 
     ``log``: the name of the log. ``cameras`` (F, 3): the camera positions. ``walls``: (x1, y1, x2, y2) of each wall.
     """
@@ -113,7 +113,7 @@ def point_figure(log: str, points: PointMap, cameras: Array, walls: Sequence[tup
 
 
 def _from_above(title: str, places: Sequence[Array], walls: Sequence[tuple[float, ...]] = ()) -> tuple[Figure, Axes]:
-    """Return a new figure and its axes, with room for the positions ``places``, each (N, 2), and with the walls."""
+    """Return a new figure and its axes, which contain the positions ``places``, each (N, 2), and show the walls."""
     width, depth = np.maximum(np.ptp(np.concatenate(places), axis=0), 1.0)
     out, axes = grid(1, 1, float(np.clip(14.0 * depth / width + 2.0, 6.0, 16.0)), title)
     axis: Axes = axes[0, 0]

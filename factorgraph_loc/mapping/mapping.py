@@ -52,9 +52,9 @@ CONVERGED = 1e-9  # m and rad
 class Entry:
     """One landmark in the comparison of a new map with a given map.
 
-    ``landmark``: its name. ``given``: its position (2,) in the given map, or None. ``learnt``: its estimate in the
-    frame of the new map, or None. ``verdict``: the result of the comparison, such as "agrees". ``flagged``: True if the
-    given position is wrong.
+    ``landmark``: its name. ``given``: its position (2,) in the given map, or None. ``learnt``: its position estimated
+    by the run, in the frame of the new map, or None. ``verdict``: the result of the comparison, such as "agrees".
+    ``flagged``: True if the given position is wrong.
     """
 
     landmark: str
@@ -65,14 +65,14 @@ class Entry:
 
     @property
     def distance(self) -> float | None:
-        """Distance [m] between the given and the learnt position, or None if either is missing."""
+        """Distance [m] between the given and the estimated position, or None if either is missing."""
         if self.given is None or self.learnt is None:
             return None
         return float(np.hypot(*(self.learnt.position - self.given)))
 
     @property
     def sigma(self) -> float | None:
-        """Standard deviation [m] of the learnt position in its least certain direction, or None if nothing was learnt."""
+        """Standard deviation [m] of the estimated position in its least certain direction, None without an estimate."""
         return None if self.learnt is None else float(positive.worst_sigma(self.learnt.covariance))
 
 
@@ -102,7 +102,7 @@ class LandmarkMap:
         return tuple(entry.landmark for entry in self.entries if entry.flagged)
 
     def summary(self, what: str = "landmarks") -> str:
-        """Return a summary in one sentence. ``what``: the plural noun for the mapped objects."""
+        """Return a summary of the map in one sentence, with ``what``, the plural noun for the mapped objects."""
         counts = Counter("flagged" if entry.flagged else entry.verdict for entry in self.entries)
         text = f"{len(self.world.landmarks)} {what} are in the new map"
         parts = [f"{counts[verdict]} {VERDICTS[verdict]}" for verdict in VERDICTS if counts[verdict]]
@@ -116,8 +116,8 @@ class Alignment:
     """The alignment of a new map with a given map.
 
     ``pose`` (3,): x, y and angle of the transform from the new map's frame to the given map's frame. ``covariance`` (3,
-    3): of this transform. ``inliers``: the number of landmarks that agree. ``factor``: a correction by which the
-    covariances of the new landmarks must be multiplied.
+    3): of this transform. ``inliers``: the number of landmarks that agree. ``factor``: multiply the covariances of the
+    new landmarks by this correction.
     """
 
     pose: Array
@@ -132,15 +132,15 @@ IN_FRAME = Alignment(np.zeros(3), np.zeros((3, 3)), 0, 1.0)
 def make_map(
     log: Log, learnt: Mapping[str, LearntPoint], *, extend: bool = False, in_frame: bool = False
 ) -> LandmarkMap:
-    """Make a map of the ``learnt`` landmarks, which a run on ``log`` estimated.
+    """Return a map of the ``learnt`` landmarks, which a run on ``log`` estimated, with a comparison.
 
     ``extend``: True if the run used the log's map and estimated only landmarks that the map lacks. The given landmarks
-    then stay unchanged. False if the run used no map. The learnt landmarks are then aligned and compared with the log's
-    map, if there is one. ``in_frame``: True if the learnt landmarks are in the frame of the log's map already.
+    then stay unchanged. False if the run used no map. The estimated landmarks are then aligned and compared with the
+    log's map, if there is one. ``in_frame``: True if the estimated landmarks are in the frame of the log's map already.
 
-    A given landmark is wrong if two conditions are met. Its distance from the learnt landmark is more than
-    ``TOLERANCE``. The squared Mahalanobis distance exceeds ``GATE``, with the sum of the covariances of learnt
-    landmark, alignment and given landmark. Raises RunFailedError if nothing was learnt.
+    A given landmark is wrong if two conditions are met. Its distance from the estimated landmark is more than
+    ``TOLERANCE``. The squared Mahalanobis distance exceeds ``GATE``, with the sum of the covariances of estimated
+    landmark, alignment and given landmark. Raises RunFailedError if nothing was estimated.
     """
     if not learnt and not extend:
         raise RunFailedError(
@@ -225,7 +225,7 @@ def _pairs(count: int) -> list[list[int]]:
 
 
 def _moved(point: LearntPoint, alignment: Alignment) -> LearntPoint:
-    """Return a learnt point in the frame of the given map, with the covariance of the ``alignment`` added."""
+    """Return an estimated point in the frame of the given map, with the covariance of the ``alignment`` added."""
     turn = _rotation(alignment.pose)
     (jacobian,) = _by_alignment(alignment.pose, point.position[None])
     covariance = alignment.factor * turn @ point.covariance @ turn.T + jacobian @ alignment.covariance @ jacobian.T
@@ -248,7 +248,7 @@ def _by_alignment(pose: Array, positions: Array) -> Array:
 
 
 def _differ(point: LearntPoint, landmark: Landmark) -> bool:
-    """True if the positions of a learnt point and of a given landmark differ significantly."""
+    """Return True if the positions of an estimated point and of a given landmark differ significantly."""
     error = point.position - np.array((landmark.x, landmark.y))
     covariance = point.covariance + landmark.spread()
     return bool(np.hypot(*error) > TOLERANCE and error @ np.linalg.solve(covariance, error) > GATE)
@@ -267,7 +267,8 @@ def _verdict(name: str, learnt: Mapping[str, LearntPoint], given: Mapping[str, L
 
 
 def _unjudged(log: Log, learnt: Mapping[str, LearntPoint], note: Notice) -> LandmarkMap:
-    """Make a map of ``learnt`` in the frame of the run's start, without a comparison. ``note``: the reason for this."""
+    """Return a map of ``learnt`` landmarks in the frame of the run's start, without a comparison. ``note``: the reason
+    for this."""
     notes = [note, *not_located(log, learnt)]
     return _assemble(log, learnt, np.zeros(3), dict.fromkeys(log.world.landmarks, "not judged"), notes=notes)
 
@@ -283,11 +284,11 @@ def _assemble(
     judged: bool = False,
     notes: Sequence[Notice] = (),
 ) -> LandmarkMap:
-    """Build the new map: first the landmarks of the given map in their order, then the new ones.
+    """Return the new map: first the landmarks of the given map in their order, then the new ones.
 
     ``learnt``: estimates by name, in the frame of the new map. ``frame`` (3,): the pose of the run's frame in the new
-    map's frame. ``verdicts``: the verdict on each landmark by name, "new" if missing. ``keep``: names of the landmarks
-    that keep their given position. ``flagged``, ``judged``, ``notes``: see :class:`LandmarkMap`.
+    map's frame. ``verdicts``: the result of each landmark's comparison by name, "new" if missing. ``keep``: names of
+    the landmarks that keep their given position. ``flagged``, ``judged``, ``notes``: see :class:`LandmarkMap`.
     """
     entries, landmarks = [], {}
     sensors = [log.rig.of(BearingRangeSettings, name) for name in log.rig.names("bearing_range")]

@@ -53,8 +53,8 @@ ASKEW, AFLOAT = 0.003, 0.003  # rad, m: standard deviations of tilt and height o
 
 @dataclass(frozen=True, eq=False)
 class PosedFrames:
-    """F images with known camera poses. ``frames``: their features. ``cameras``: their camera poses. ``covariances``
-    (F, 6, 6): of perturbations in the cameras' own frames, rotation first."""
+    """F images with known camera poses. ``frames``: the features of the images. ``cameras``: the camera poses.
+    ``covariances`` (F, 6, 6): of perturbations of these poses in the cameras' own frames, rotation first."""
 
     frames: list[CameraFrame]
     cameras: Cameras
@@ -92,11 +92,11 @@ class PointSettings(FileModel):
 class PointReport:
     """Statistics of a map of points.
 
-    ``keyframes``, ``pairs`` (of compared images), ``tracks``, ``triangulated`` (points), ``points`` (of the map),
-    ``observations`` (of these points): numbers of each. ``rms``, ``mad`` [px]: root mean square and median absolute
-    value of the residuals. ``parallax`` [rad], ``sigma`` [m]: medians over points of the parallax and of the standard
-    deviation in the worst direction. ``shifted`` [m], ``turned`` [rad]: median corrections of the camera poses.
-    ``focal`` [px]: the focal length fx. ``fused``: the number of points that the extended map contained already.
+    Numbers: ``keyframes``, ``pairs`` of compared images, ``tracks``, ``triangulated`` points, ``points`` of the map,
+    and ``observations`` of these points. ``rms``, ``mad`` [px]: root mean square and median absolute value of the
+    residuals. ``parallax`` [rad], ``sigma`` [m]: medians over points of the parallax and of the standard deviation in
+    the worst direction. ``shifted`` [m], ``turned`` [rad]: median corrections of the camera poses. ``focal`` [px]: the
+    focal length fx. ``fused``: the number of points that the extended map contained already.
     """
 
     keyframes: int
@@ -118,7 +118,7 @@ class PointReport:
 @dataclass(frozen=True, eq=False)
 class MadePoints:
     """A new map of points. ``points``: the map. ``cameras``: the adjusted poses of its keyframes. ``model``: the
-    calibration of the camera, adjusted if that was requested. ``report``: statistics."""
+    calibration of the camera, adjusted if that was requested. ``report``: statistics of the map."""
 
     points: PointMap
     cameras: Cameras
@@ -132,11 +132,11 @@ def map_points(
     settings: PointSettings | None = None,
     progress: Callable[[float], None] = lambda _: None,
 ) -> MadePoints:
-    """Make a map of points from ``posed``, images with known camera poses.
+    """Return a map of points, triangulated from images with known camera poses (``posed``).
 
     ``progress``: is called with the fraction done. Raises RunFailedError if no point is observed from several
-    positions, if points and cameras cannot be adjusted, or if no point meets the settings. Raises InputError if the
-    settings require a new calibration of a camera with another distortion than Brown's.
+    positions, if the adjustment fails, or if no point meets the settings. Raises InputError if the settings require a
+    new calibration, and the camera has another distortion than Brown's.
     """
     settings = settings or PointSettings()
     posed = posed[chosen_keyframes(posed, settings)]
@@ -186,7 +186,7 @@ def chosen_keyframes(posed: PosedFrames, settings: PointSettings) -> Integers:
 
 
 def epipolar_gate(model: CameraModel, covariances: Array) -> float:
-    """Return the allowed distance [px] of a match from its epipolar line. ``covariances`` (F, 6, 6): of the cameras."""
+    """Return the largest distance [px] of a match from its epipolar line. ``covariances`` (F, 6, 6): of cameras."""
     turn, shift = (np.median(np.trace(covariances[:, i : i + 3, i : i + 3], axis1=1, axis2=2)) / 3.0 for i in (0, 3))
     sigma = np.sqrt(2.0 * (model.sigma**2 + model.fx**2 * (turn + shift / DEPTH**2)))
     return float(np.clip(GATE * sigma, NARROW, WIDE))
@@ -197,8 +197,8 @@ def point_map(
 ) -> PointMap:
     """Return a map of T points. Each point has the descriptors of at most ``views`` observations.
 
-    ``points`` (T, 3), ``covariances`` (T, 3, 3): positions and their covariances. ``cameras``: camera poses.
-    ``tracks``: observations.
+    ``posed``: the images. ``points`` (T, 3), ``covariances`` (T, 3, 3): positions and their covariances. ``cameras``:
+    camera poses. ``tracks``: the observations of the points.
     """
     shown = _different_views(cameras, tracks, points, views)
     views_of = list(zip(tracks.frame[shown].tolist(), tracks.feature[shown].tolist(), strict=True))
@@ -244,8 +244,8 @@ def _made(
 
 
 def _kept(adjusted: Bundle, settings: PointSettings) -> tuple[Tracks, Array, Array, Array]:
-    """Return tracks, positions (T, 3), covariances (T, 3, 3) and parallaxes (T,) [rad] of points that meet
-    ``settings``."""
+    """Return the points that meet ``settings``: tracks, positions (T, 3), covariances (T, 3, 3) and parallaxes (T,)
+    [rad]."""
     tracks, points, covariances = adjusted.tracks, adjusted.points, adjusted.point_covariances
     angles = parallax(adjusted.cameras, points, tracks)
     good = (

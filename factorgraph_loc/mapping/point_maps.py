@@ -28,11 +28,12 @@ LEAST = 1e-6  # m: standard deviation that is added to all points, so that exact
 
 
 def merged(first: PointMap, second: PointMap) -> tuple[PointMap, int]:
-    """Merge two maps. Returns the merged map, and the number of points that both maps have in common.
+    """Return two maps merged to one, and the number of points that both maps have in common.
 
     Common points are recognised by the descriptors of their views, and keep their names in ``first``. The other points
     of ``second`` with views get new names. Points without views keep their names. Raises InputError if the maps have
-    features of different kinds, or if a point of ``second`` without views has the name of a point of ``first``.
+    features of different kinds. Also raises it if a point of ``second`` without views has the name of a point of
+    ``first``.
     """
     kinds = {points.feature for points in (first, second) if points.feature}
     if len(kinds) > 1:
@@ -59,7 +60,8 @@ def merged(first: PointMap, second: PointMap) -> tuple[PointMap, int]:
 def thinned(points: PointMap, most: int) -> PointMap:
     """Return a map with all points without views, and at most ``most`` of the points with views.
 
-    As many cells of space as possible keep points. In each cell, the points with the smallest covariances are kept.
+    The points are taken from as many cells of a grid in space as possible. In each cell, the points with the smallest
+    covariances are kept.
     """
     viewed = np.unique(points.owners)
     if len(viewed) <= most:
@@ -144,7 +146,7 @@ def _same(first: PointMap, second: PointMap) -> Integers:
 
 
 def _views(points: PointMap) -> list[Integers]:
-    """Return for each point the indices of its views."""
+    """Return the indices of the views of each point, one array per point."""
     order = np.argsort(points.owners, kind="stable")
     return np.split(order, np.cumsum(np.bincount(points.owners, minlength=len(points)))[:-1])
 

@@ -39,7 +39,7 @@ INTERPOLATED, LONGEST = 0.05, 2.0  # s between interpolated poses, and largest t
 def focused(
     log: Log, observations: TagObservations, learnt: Mapping[int, LearntPoint], keyframes: Trajectory | None = None
 ) -> dict[int, LearntPoint]:
-    """Improve positions of tags by the signal phases of their reads. Returns the new positions by index of the tag.
+    """Return positions of tags, by index of the tag, improved by the signal phases of their reads.
 
     ``learnt``: the initial positions, by index of the tag. ``keyframes``: the estimated trajectory of the robot. If it
     is None, the log's reference is used. A position does not change if the height of the tag is unknown or too few
@@ -66,8 +66,8 @@ def focused(
 
 
 def _focused(model: PhaseModel, reads: PhaseReads, height: float, prior: LearntPoint) -> LearntPoint:
-    """Improve the position ``prior`` of one tag at ``height`` [m]. ``reads``: the reads of this tag, with antenna poses
-    in the world frame."""
+    """Return an improved position of one tag at ``height`` [m]. ``prior``: its position before. ``reads``: the reads of
+    this tag, with antenna poses in the world frame."""
     information = np.asarray(np.linalg.inv(prior.covariance), dtype=np.float64)
     position = prior
     for _ in range(SELECTIONS):
@@ -108,7 +108,7 @@ def _refined(
     likelihood: PhaseLikelihood, reads: PhaseReads, start: Array, information: Array, off: Array
 ) -> tuple[Array, Array]:
     """Maximise the posterior density by Fisher scoring, starting at the displacement ``off`` (2,). Returns the optimal
-    displacement (2,) and the information (2, 2) there. ``start``, ``information``: see :func:`_best`."""
+    displacement (2,) and its information matrix (2, 2). ``start``, ``information``: see :func:`_best`."""
 
     def at(off: Array) -> tuple[float, Array, Array]:
         score, moved = likelihood.score(np.array((*-off, 0.0)), reads), off + start

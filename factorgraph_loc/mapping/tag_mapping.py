@@ -37,9 +37,9 @@ class MadeTags:
     """A new map of tags, and its comparison with the given map.
 
     ``world``: the map as written to a file, in the survey frame (rig section ``[survey]``). ``made``: the same tags as
-    landmarks in the world frame, and the verdicts on the given tags. ``poses`` (N, 3): the trajectory in the world
-    frame. ``open``: the reason why a tag was not located, by EPC. ``modes``: candidate positions of ambiguous tags in
-    the world frame, by EPC.
+    landmarks in the world frame, compared with the given tags. ``poses`` (N, 3): the trajectory in the world frame.
+    ``open``: the reason why a tag was not located, by EPC. ``modes``: candidate positions of ambiguous tags in the
+    world frame, by EPC.
     """
 
     world: World
@@ -50,7 +50,7 @@ class MadeTags:
 
     @property
     def rms(self) -> float | None:
-        """Root mean square distance [m] between given and learnt positions, None if no tag has both."""
+        """Root mean square distance [m] between given and estimated positions, None if no tag has both."""
         distances = [e.distance for e in self.made.entries if e.distance is not None and e.verdict != "given"]
         return float(np.sqrt(np.mean(np.square(distances)))) if distances and self.made.judged else None
 
@@ -64,13 +64,13 @@ def map_tags(
     height: float | None = None,
     progress: Callable[[float], None] = lambda _: None,
 ) -> MadeTags:
-    """Make a map of the tags that a log read.
+    """Return a map of the tags that a log read.
 
     ``poses``: "reference" uses the poses of the log's reference, "odometry" estimates poses and tags together.
     ``prior``: the start pose, which defines the frame of estimated poses. If it is None, the first pose is the origin,
-    and the facings of the log's map are not used. ``extend``: True keeps the tags of the log's map and uses them to
-    estimate the poses. False estimates all tags, and compares them with the log's map. ``height`` [m]: of tags that the
-    map lacks; None uses the mean height of the antennas. ``progress``: is called with the fraction done.
+    and the directions of tags in the log's map are not used. ``extend``: True keeps the tags of the log's map and uses
+    them to estimate the poses. False estimates all tags, and compares them with the log's map. ``height`` [m]: of tags
+    that the map lacks; None uses the mean height of the antennas. ``progress``: is called with the fraction done.
 
     Raises InputError if the log has no reads, no antennas in its rig or no suitable reference. Raises RunFailedError if
     no tag could be located.
@@ -120,8 +120,8 @@ def _along_reference(
 ) -> tuple[dict[int, LearntPoint], Array, list[TagPosterior], Array]:
     """Locate T tags along the log's reference.
 
-    Returns the positions of located tags by index, the facings (T,) [rad] and search results of all tags, and the robot
-    poses (K, 3) at the antenna observations.
+    Returns the positions of located tags by index, and the directions (T,) [rad] of all tags' fronts. Also returns the
+    search results of all tags, and the robot poses (K, 3) at the antenna observations.
     """
     if log.reference is None:
         raise InputError(f"{log.name}: has no reference: map its tags with --poses odometry")
@@ -164,7 +164,7 @@ def _why(posterior: TagPosterior, reads: int) -> Notice:
 
 
 def _as_landmark(log: Log, name: str, position: Array) -> Landmark:
-    """Convert a given tag to a landmark in the world frame. ``position`` (2,): its position in the world frame."""
+    """Return a given tag as a landmark in the world frame. ``position`` (2,): its position in the world frame."""
     tag = log.world.tags[name]
     x, y = position.tolist()
     if tag.covariance is None:
@@ -185,10 +185,11 @@ def _turned(covariance: Array, angle: float) -> tuple[float, float, float]:
 def _world(
     log: Log, observations: TagObservations, made: LandmarkMap, facing: Mapping[str, float], *, in_given_frame: bool
 ) -> World:
-    """Return the map as written to a file: learnt tags in the survey frame (rig section ``[survey]``), given ones as given.
+    """Return the map as written to a file: estimated tags in the survey frame (rig section ``[survey]``), given ones
+    unchanged.
 
-    ``made``: the map in the world frame. ``facing``: the facings [rad] of learnt tags in the world frame, by EPC.
-    ``in_given_frame``: True if the new map has the frame of the log's map.
+    ``made``: the map in the world frame. ``facing``: by EPC, the direction [rad] of an estimated tag's front in the
+    world frame. ``in_given_frame``: True if the new map has the frame of the log's map.
     """
     survey: SurveySettings = log.rig.of(SurveySettings)
     transform = survey.transform()

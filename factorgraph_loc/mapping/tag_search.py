@@ -49,7 +49,7 @@ PER_EVALUATION = 2000  # number of observations in one evaluation of the lattice
 @dataclass(frozen=True, eq=False)
 class TagCandidates:
     """C candidates for the positions of tags. ``tag`` (C,): index of the tag. ``places`` (C, 2) [m]: its position.
-    ``facing`` (C,) [rad]: its facing, NaN if the detection model does not depend on it."""
+    ``facing`` (C,) [rad]: the direction of its front, NaN if the detection model does not depend on it."""
 
     tag: Integers
     places: Array
@@ -63,7 +63,8 @@ class TagCandidates:
 class TagMode:
     """A mode of the posterior density of a tag's position.
 
-    ``weight``: the probability of this mode. ``position`` (2,) [m] and ``covariance`` (2, 2). ``facing`` [rad]: NaN if unknown.
+    ``weight``: the probability of this mode. ``position`` (2,) [m] and ``covariance`` (2, 2). ``facing`` [rad]: the
+    direction of the tag's front, NaN if unknown.
     """
 
     weight: float
@@ -79,10 +80,11 @@ class TagMode:
 
 @dataclass(frozen=True)
 class TagPosterior:
-    """The result of the search for one tag.
+    """The result of the search for the position of one tag.
 
     ``modes``: by descending weight; the weights sum to 1. ``reads``: the number of inventory rounds that read the tag.
-    ``gain``: the tempered log-likelihood ratio of the best position to a position out of reach of all antennas.
+    ``gain``: the log-likelihood ratio of the best position to a position out of reach of all antennas. It is multiplied
+    by an exponent below 1, because reads are correlated.
     """
 
     modes: tuple[TagMode, ...]
@@ -91,7 +93,7 @@ class TagPosterior:
 
     @property
     def is_explained(self) -> bool:
-        """True if the best position explains the reads significantly better than false reads do."""
+        """True if the best position explains the reads significantly better than randomly false reads do."""
         return bool(self.modes) and self.gain > GAIN
 
     @property
@@ -106,10 +108,10 @@ class TagPosterior:
 
 
 def search(model: RfidModel, counts: TagReadCounts, heights: Array, facing: Array) -> list[TagPosterior]:
-    """Search for the positions of T tags. Returns a result per tag.
+    """Search for the positions of T tags. Returns one result per tag.
 
-    ``counts``: the reads of these tags, with the robot poses in the world frame as ``offsets``. ``heights`` (T,) [m],
-    ``facing`` (T,) [rad]: of the tags. A facing is NaN if it is unknown.
+    ``counts``: the reads of these tags, with the robot poses in the world frame as ``offsets``. ``heights`` (T,) [m]:
+    of the tags. ``facing`` (T,) [rad]: the directions of the tags' fronts, NaN if unknown.
     """
     counts = merged(counts, *FINE)
     uses_facing = any(m.uses_facing for m in model.models)
@@ -137,7 +139,8 @@ def search(model: RfidModel, counts: TagReadCounts, heights: Array, facing: Arra
 
 
 def merged(counts: TagReadCounts, distance: float, angle: float) -> TagReadCounts:
-    """Add up consecutive read counts of an antenna while the robot stays within ``distance`` [m] and ``angle`` [rad]."""
+    """Return read counts, summed over consecutive counts of an antenna while the robot is within ``distance`` [m] and
+    ``angle`` [rad]."""
     group = np.empty(len(counts.antennas), dtype=np.int64)
     first: dict[int, int] = {}
     kept: list[int] = []
@@ -184,7 +187,8 @@ def _lattice_search(
 
 
 def _cells(places: Array, distance: float) -> Array:
-    """Return the lattice points (G, 2) within ``distance`` [m] of any of the robot positions ``places`` (K, 2)."""
+    """Return the lattice points (G, 2) within ``distance`` [m] of at least one of the robot positions ``places`` (K,
+    2)."""
     low, high = places.min(axis=0) - distance, places.max(axis=0) + distance
     axes = [np.arange(a, b + CELL, CELL) for a, b in zip(low, high, strict=True)]
     x, y = np.meshgrid(*axes, indexing="ij")
@@ -199,9 +203,10 @@ def _cells(places: Array, distance: float) -> Array:
 def _nll(
     model: RfidModel, counts: TagReadCounts, tags: NDArray[np.int64], cells: Array, height: float, direction: float
 ) -> Array:
-    """Return the tempered negative log-likelihood (G, S) of S ``tags`` at the lattice points ``cells`` (G, 2).
+    """Return the negative log-likelihood (G, S) of S ``tags`` at the lattice points ``cells`` (G, 2). It is multiplied
+    by an exponent below 1, because reads are correlated.
 
-    ``height`` [m], ``direction`` [rad]: height and facing of the tags.
+    ``height`` [m]: height of the tags. ``direction`` [rad]: direction of their fronts.
     """
     points = np.column_stack((cells, np.full(len(cells), height)))
     likelihood = RfidLikelihood(model, TagArray(points, np.full(len(cells), direction)))
@@ -220,9 +225,11 @@ def _nll(
 
 
 def _best(cells: Array, table: list[tuple[Array, float]]) -> list[tuple[float, float, float]]:
-    """Return at most :data:`CANDIDATES` best candidates (x, y, facing) of one tag, at least :data:`APART` from each other.
+    """Return at most :data:`CANDIDATES` best candidates (x, y, facing) of one tag. They are at least :data:`APART`
+    apart.
 
-    ``table``: for each facing the negative log-likelihood (G,) at the lattice points ``cells`` (G, 2), and the facing.
+    ``table``: pairs of a negative log-likelihood (G,) at the lattice points ``cells`` (G, 2), and a facing. A facing is
+    the direction [rad] of the tag's front.
     """
     nll = np.stack([column for column, _ in table])
     directions = np.array([direction for _, direction in table])
@@ -283,7 +290,7 @@ def _modes(optima: TagCandidates, nll: Array, covariances: Array) -> tuple[TagMo
 
 
 def of_tags(counts: TagReadCounts, tags: Integers) -> TagReadCounts:
-    """Return the read counts of the tags with the indices ``tags`` (C,)."""
+    """Return the read counts of only the tags with the indices ``tags`` (C,)."""
     return TagReadCounts(counts.offsets, counts.antennas, counts.rounds, np.ascontiguousarray(counts.hits[:, tags]))
 
 

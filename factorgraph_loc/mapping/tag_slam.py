@@ -50,13 +50,13 @@ Factors = list[tuple[Factor, tuple[int, ...]]]
 
 @dataclass(frozen=True, eq=False)
 class TagObservations:
-    """K antenna observations of T tags, ordered by time. An observation is what one antenna read in some inventory rounds.
+    """K antenna observations of T tags, ordered by time. Each is what one antenna read in some inventory rounds.
 
     ``names``: the EPCs of the T tags. ``t`` (K,) [s]: times. ``antennas`` (K,): indices in the reader's ``model``.
     ``rounds`` (K,): the number of inventory rounds. ``hits`` (K, T): the number of these rounds that read each tag.
     ``heights`` (T,) [m]: the heights of the tags. ``has_height`` (T,): False where the height is only assumed.
-    ``facing`` (T,) [rad]: the facings in the world frame, NaN where unknown. ``positions`` (T, 2) [m]: from the log's
-    map, NaN where the map lacks the tag.
+    ``facing`` (T,) [rad]: the directions of the tags' fronts in the world frame, NaN where unknown. ``positions`` (T,
+    2) [m]: from the log's map, NaN where the map lacks the tag.
     """
 
     model: RfidModel
@@ -79,8 +79,8 @@ class TagObservations:
 def tag_observations(log: Log, height: float | None = None) -> TagObservations:
     """Return the antenna observations of all tags that a log read or that its map contains.
 
-    Heights and facings are those of the log's map. Tags that are not in the map have an unknown facing and the height
-    ``height`` [m]. If ``height`` is None, they have the mean height of the antennas.
+    Heights and directions of tags are from the log's map. Tags that are not in the map have an unknown direction and
+    the height ``height`` [m]. If ``height`` is None, they have the mean height of the antennas.
 
     Raises InputError if the log has no reads, or no reads by an antenna of its rig.
     """
@@ -127,7 +127,7 @@ def tag_observations(log: Log, height: float | None = None) -> TagObservations:
 def _rows(
     m: RfidScan, antennas: dict[str, int], index: dict[str, int]
 ) -> list[tuple[float, int, int, NDArray[np.int64]]]:
-    """Return the antenna observations of a scan: time, index of the antenna, number of rounds, and hits (T,).
+    """Return the antenna observations of a scan: time [s], index of the antenna, number of rounds, and reads (T,).
 
     ``antennas``, ``index``: the indices of antennas and of T tags by name.
     """
@@ -145,8 +145,8 @@ class TagSlam:
     """The estimated trajectory and map of tags.
 
     ``t`` (M,) [s], ``poses`` (M, 3): times and poses of the keyframes. ``tags``: the estimated positions of located
-    tags, by index. ``facing`` (T,) [rad]: the facings of all T tags, NaN where unknown. ``posteriors``: the search
-    results of all T tags.
+    tags, by index. ``facing`` (T,) [rad]: the directions of all T tags' fronts, NaN where unknown. ``posteriors``: the
+    search results of all T tags.
     """
 
     t: Array
@@ -163,7 +163,7 @@ def tag_slam(
     known: NDArray[np.bool_],
     progress: Callable[[float], None],
 ) -> TagSlam:
-    """Estimate the positions of tags and the trajectory of the robot together.
+    """Return the positions of tags and the trajectory of the robot, estimated together.
 
     ``log``: supplies odometry and rig. ``prior``: the start pose, in the frame of the result. ``known`` (T,): mask of
     the tags that are fixed at ``observations.positions``. ``progress``: is called with the fraction done.

@@ -45,7 +45,7 @@ class Cameras:
 
 @dataclass(frozen=True, eq=False)
 class Tracks:
-    """N observations of T points.
+    """N observations of T points in images.
 
     ``track`` (N,): the index of the point, from 0 to T - 1. ``frame`` (N,): the index of the image. ``feature`` (N,):
     the index of the feature in this image. ``pixels`` (N, 2): the observed pixel.
@@ -69,8 +69,8 @@ class Tracks:
         return np.bincount(self.track, minlength=self.count)
 
     def kept(self, mask: Truths) -> tuple[Tracks, Integers]:
-        """Return the tracks with only the observations for which ``mask`` (N,) is True. Points without an observation
-        are removed, and the rest get consecutive numbers. Also returns the old number of each remaining point."""
+        """Return only the observations for which ``mask`` (N,) is True. Points without an observation are removed, and
+        the rest get consecutive numbers. Also returns the old number of each remaining point."""
         old, track = np.unique(self.track[mask], return_inverse=True)
         left = (self.frame[mask], self.feature[mask], self.pixels[mask])
         return Tracks(track.astype(np.int64), *left), old
@@ -116,6 +116,7 @@ def reproject(model: CameraModel, cameras: Cameras, points: Array, tracks: Track
 
 def triangulate(model: CameraModel, cameras: Cameras, tracks: Tracks) -> Triangulated:
     """Triangulate the points of ``tracks`` for exact camera poses (:mod:`factors.camera.triangulation_kernels`).
+    Returns their positions, covariances and residuals.
 
     The parallax of a point is set to 0 if its rays do not determine it.
     """
@@ -149,7 +150,7 @@ def keyframes(cameras: Cameras, distance: float, angle: float) -> Integers:
     """Return the indices of the cameras that become keyframes.
 
     The first camera is a keyframe, and each later one that differs from all earlier keyframes by ``distance`` [m] or
-    ``angle`` [rad]. A second drive through the same place therefore adds no keyframes.
+    ``angle`` [rad]. A second drive through the same region therefore adds no keyframes.
     """
     chosen: list[int] = []
     for i in range(len(cameras)):
@@ -199,9 +200,9 @@ def near_epipolar_lines(
 def matched_pairs(
     model: CameraModel, cameras: Cameras, frames: Sequence[CameraFrame], pairs: Sequence[tuple[int, int]], gate: float
 ) -> list[tuple[int, int, Integers, Array]]:
-    """Match the features of each of the ``pairs`` (i, j) of images. Pairs without a match are left out.
+    """Return the matching features of each of the ``pairs`` (i, j) of images. Pairs without a match are left out.
 
-    ``gate`` [px]: see :func:`near_epipolar_lines`. Returns for each pair: i, j, the indices (K, 2) of matching
+    ``gate`` [px]: see :func:`near_epipolar_lines`. The result for a pair is i, j, the indices (K, 2) of matching
     features, and the distances (K,) of their descriptors. Distances are divided by their median over the pair of
     images.
     """
@@ -218,7 +219,7 @@ def matched_pairs(
 
 
 def chained(frames: Sequence[CameraFrame], matches: Sequence[tuple[int, int, Integers, Array]]) -> Tracks:
-    """Join matches to tracks: features of different images that show the same point.
+    """Return matches joined to tracks. A track is a set of features of different images that show the same point.
 
     Matches are joined in order of descriptor distance. A match that would join two features of one image is omitted.
     ``matches``: the result of :func:`matched_pairs`.

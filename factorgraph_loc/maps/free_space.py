@@ -19,7 +19,8 @@ SPACING = 0.05  # m between points of a path
 
 
 class Walled(Protocol):
-    """An object with walls, such as a map. ``walls``: ends (x1, y1, x2, y2) of each wall [m]. ``name``: in errors."""
+    """An object with walls, such as a map. ``walls``: ends (x1, y1, x2, y2) [m] of each. ``name``: its name in
+    errors."""
 
     @property
     def name(self) -> str: ...
@@ -60,7 +61,7 @@ class FreeSpace:
         return len(self.centres) * CELL**2
 
     def drawn(self, rng: np.random.Generator, count: int) -> Array:
-        """Return ``count`` random poses (count, 3), spread evenly over the free cells and all headings."""
+        """Return ``count`` random poses (count, 3), uniformly distributed over the free cells and all headings."""
         cells = np.floor((np.arange(count) + rng.random()) * len(self.centres) / count)
         places = self.centres[cells.astype(np.int64)] + CELL * (rng.random((count, 2)) - 0.5)
         # a low-discrepancy sequence (golden ratio), so that neighbouring cells get different headings
@@ -75,7 +76,7 @@ class FreeSpace:
         return np.where(inside, self.index[i, j], -1)
 
     def is_clear(self, a: Array, b: Array) -> bool:
-        """True if the straight line between two points ``a`` (2,) and ``b`` (2,) crosses only free cells."""
+        """Return True if the straight line between two points ``a`` (2,) and ``b`` (2,) crosses only free cells."""
         return bool(_is_clear(self.index, self.origin, np.asarray(a, dtype=float), np.asarray(b, dtype=float)))
 
 
@@ -116,16 +117,16 @@ def nearest_walls(world: Walled, points: Array) -> tuple[Array, NDArray[np.int64
 
 
 def shortest_path(space: FreeSpace, start: int, end: int) -> Array:
-    """Return the corners (N, 2) [m] of the shortest path from the cell ``start`` to the cell ``end``.
+    """Return the corners (N, 2) [m] of a short path between two free cells. ``start``, ``end``: indices of the cells.
 
-    The path is shortest among the paths from cell to neighbouring cell, then :func:`straightened`.
+    The path is the shortest one from neighbouring cell to neighbouring cell, then :func:`straightened`.
     """
     _, predecessors = csgraph.dijkstra(space.graph, directed=False, indices=end, return_predecessors=True)
     return straightened(space, space.centres[chain(predecessors, start)])
 
 
 def chain(predecessors: NDArray[np.int32], start: int) -> list[int]:
-    """Return the cells from ``start`` to the root of a tree of shortest paths.
+    """Return the indices of the cells from ``start`` to the root of a tree of shortest paths.
 
     ``predecessors`` (K,): the next cell towards the root, from each cell. It is negative at the root.
     """

@@ -68,7 +68,7 @@ class Marker(FileModel):
 
 
 class MarkerSettings(FileModel):
-    """Settings of marker detection in images. ``family``: the family of markers to detect."""
+    """Settings of the detection of square markers in images. ``family``: the family of markers to detect."""
 
     family: MarkerFamily
 
@@ -86,7 +86,7 @@ def marker_of(point: str) -> str | None:
 
 
 def corner_points(markers: Mapping[str, Marker]) -> PointMap:
-    """Return the corners of all ``markers`` as a map of named points. ``markers``: each marker by its name."""
+    """Return the corners of all ``markers`` (by name) as a map of named points."""
     names = [name for marker in markers for name in corner_names(marker)]
     positions = np.array([marker.corners() for marker in markers.values()]).reshape(-1, 3)
     covariances = np.array([marker.sigma**2 * np.eye(3) for marker in markers.values() for _ in CORNERS]).reshape(

@@ -26,8 +26,8 @@ MIN_EXTENT = 2.0  # cells: smaller groups of occupied cells are noise of the map
 
 
 class MapFile(FileModel):
-    """The YAML file of map_server (ROS or Nav2), whose documentation explains the keys. ``origin``: x, y [m] and yaw
-    [rad] of the lower left corner of the image."""
+    """The content of a map's YAML file for map_server (ROS or Nav2), whose documentation explains the keys. ``origin``:
+    x, y [m] and yaw [rad] of the lower left corner of the image."""
 
     image: str
     resolution: Annotated[float, Field(ge=1e-4, le=10.0), InUnit("m per cell")]

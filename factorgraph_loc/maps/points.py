@@ -81,7 +81,7 @@ class PointMap:
 
     @classmethod
     def of(cls, names: Sequence[str], positions: Array, covariances: Array | None = None) -> PointMap:
-        """Return a map of named points without descriptors. Without ``covariances``, positions are exact."""
+        """Return a map of named points without descriptors. If ``covariances`` is None, the positions are exact."""
         spatial = np.zeros((len(names), 3, 3)) if covariances is None else covariances
         return cls(
             tuple(names),
@@ -94,7 +94,7 @@ class PointMap:
         )
 
     def chosen(self, which: Integers) -> PointMap:
-        """Return a map of the points with the indices ``which``, and their views."""
+        """Return a map of only the points with the indices ``which``, and their views."""
         place = np.full(len(self), -1, dtype=np.int64)
         place[which] = np.arange(len(which))
         views = np.flatnonzero(place[self.owners] >= 0)
@@ -110,7 +110,7 @@ class PointMap:
         )
 
     def with_points(self, added: PointMap, source: object) -> PointMap:
-        """Return the map with points ``added``, which have no views. ``source``: their file.
+        """Return the map with the points ``added``, which have no views. ``source``: their file, for errors.
 
         Raises InputError if a name exists already.
         """
@@ -305,10 +305,10 @@ class CommonError:
 
 
 def carried(covariances: Array, arms: Array) -> Array:
-    """Return the covariances (N, 3, 3) of the poses (x, y, heading) [m, rad] of other points on the same rigid bodies.
+    """Return the covariances (N, 3, 3) of the poses (x, y, heading) [m, rad] of N points on rigid bodies.
 
-    ``covariances`` (N, 3, 3): of one point on each body. ``arms`` (N, 2): the vectors from this point to the other
-    point [m]. All are in the world frame.
+    ``covariances`` (N, 3, 3): of another point on each body. ``arms`` (N, 2): the vectors from that point to the point
+    [m]. All are in the world frame.
     """
     lever = np.repeat(np.eye(3)[None], len(arms), axis=0)
     lever[:, 0, 2], lever[:, 1, 2] = -arms[:, 1], arms[:, 0]

@@ -83,10 +83,10 @@ class _Tags(FileModel):
 
 
 def read_tag_file(content: dict[str, Any], source: object, folder: Path) -> dict[str, dict[str, float]]:
-    """Return the markers of a file of apriltag_ros, by name. Keys and values of a marker are those in a world file.
+    """Return the markers of a file of apriltag_ros, by name. Each is a dict with the keys and values of a world file.
 
     ``content``: the section ``[markers]`` of the world file ``source``, see :class:`TagFile`. ``folder``: the folder of
-    the world file. A standalone tag without a pose in ``at`` is omitted. Raises InputError if no marker remains.
+    the world file. A standalone tag without a pose in ``at`` is left out. Raises InputError if no marker remains.
     """
     settings = parse_model(TagFile, content, f"{source} [markers]")
     path = inside(folder, settings.file, source)
@@ -123,8 +123,8 @@ def read_tag_file(content: dict[str, Any], source: object, folder: Path) -> dict
 
 
 def _marker(path: Path, tag: BundledTag, rotation: Array, position: Array) -> dict[str, float]:
-    """Return the marker of a ``tag``, as keys and values of a world file. ``rotation`` (3, 3), ``position`` (3,): the
-    pose of its bundle in the world. ``path``: the file to name in errors."""
+    """Return a ``tag`` as a dict with the keys and values of a world file. ``rotation`` (3, 3), ``position`` (3,): the
+    pose of its bundle in the world. ``path``: the name of the file in errors."""
     quaternion = np.array((tag.qx, tag.qy, tag.qz, tag.qw))
     if not abs(float(np.linalg.norm(quaternion)) - 1.0) <= UNIT:
         raise bad_field(path, f"tag {tag.id}: qx, qy, qz, qw", quaternion.tolist(), "a unit quaternion")

@@ -38,7 +38,7 @@ FEW = 40  # at most this many images are rendered by one process, because starti
 
 @dataclass(frozen=True, eq=False)
 class Film:
-    """The N images of a simulated drive. ``film[i]`` renders image i, (H, W, 3) BGR. The result does not depend on other images.
+    """The N images of a simulated drive. ``film[i]`` renders image i, (H, W, 3) BGR, independently of other images.
 
     ``times`` (N,) [s]: the times of the middle of the exposures. ``stamps`` (N,) [s]: the same times by the camera's
     clock. ``truth``: the true trajectory of the robot. ``renderer``: renders the images, and computes the 3-D point of
@@ -66,7 +66,7 @@ class Film:
         return self.renderer.image(position, rotation, velocity=velocity, turn=turn, gain=self._gain(t), rng=noise)
 
     def __iter__(self) -> Iterator[tuple[float, Image]]:
-        """Iterate over stamps and images."""
+        """Yield the time stamp [s] by the camera's clock and the image (H, W, 3), one image after the other."""
         for i, stamp in enumerate(self.stamps.tolist()):
             yield stamp, self[i]
 

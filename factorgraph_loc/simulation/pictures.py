@@ -19,17 +19,17 @@ PAPER: Colour = (232, 238, 238)
 
 
 def vivid(rng: np.random.Generator) -> Colour:
-    """Return a random saturated colour."""
+    """Return a random saturated colour, as BGR."""
     return _colour(rng.random(), rng.uniform(0.3, 0.85), rng.uniform(0.3, 0.9))
 
 
 def pale(rng: np.random.Generator) -> Colour:
-    """Return a random colour of painted walls."""
+    """Return a random colour of painted walls, as BGR."""
     return _colour(rng.random(), rng.uniform(0.04, 0.2), rng.uniform(0.66, 0.88))
 
 
 def wood(rng: np.random.Generator) -> Colour:
-    """Return a random colour of wood."""
+    """Return a random colour of wood, as BGR."""
     return _colour(rng.uniform(0.04, 0.11), rng.uniform(0.3, 0.65), rng.uniform(0.4, 0.8))
 
 
@@ -76,7 +76,7 @@ def write(canvas: Canvas, rng: np.random.Generator, box: tuple[int, int, int, in
 
 
 def page(rng: np.random.Generator, height: int, width: int) -> Canvas:
-    """Return a printed sheet with a headline, lines and possibly a figure."""
+    """Return a picture (height, width, 3) of a printed sheet with a headline, lines and possibly a figure."""
     out = filled(height, width, PAPER if rng.random() < 0.6 else pale(rng))
     edge = max(2, width // 12)
     top = height // 5
@@ -90,7 +90,7 @@ def page(rng: np.random.Generator, height: int, width: int) -> Canvas:
 
 
 def abstract(rng: np.random.Generator, height: int, width: int) -> Canvas:
-    """Return a picture of overlapping shapes of many sizes."""
+    """Return a picture (height, width, 3) of overlapping shapes of many sizes."""
     out = filled(height, width, vivid(rng))
     for scale in (0.5, 0.5, *([0.3] * 4), *([0.15] * 6), *([0.08] * 8)):
         at, radius = rng.uniform((0, 0), (width, height)), scale * min(width, height) * rng.uniform(0.6, 1.2) + 1.0
@@ -109,7 +109,7 @@ def abstract(rng: np.random.Generator, height: int, width: int) -> Canvas:
 
 
 def poster(rng: np.random.Generator, height: int, width: int) -> Canvas:
-    """Return a poster: shapes in a frame, with a title below."""
+    """Return a picture (height, width, 3) of a poster: shapes in a frame, with a title below."""
     out = filled(height, width, PAPER if rng.random() < 0.5 else vivid(rng))
     edge, foot = max(3, width // 14), height // 5
     paste(out, abstract(rng, max(height - foot - edge, 8), max(width - 2 * edge, 8)), edge, edge)
@@ -119,7 +119,7 @@ def poster(rng: np.random.Generator, height: int, width: int) -> Canvas:
 
 
 def landscape(rng: np.random.Generator, height: int, width: int) -> Canvas:
-    """Return a picture of sky, hills and houses."""
+    """Return a picture (height, width, 3) of sky, hills and houses."""
     sky, far = np.array(vivid(rng), dtype=float), np.array(PAPER, dtype=float)
     share = np.linspace(0.0, 1.0, height)[:, None, None]
     out = np.broadcast_to((1.0 - share) * sky + share * far, (height, width, 3)).astype(np.uint8)
@@ -137,7 +137,7 @@ def landscape(rng: np.random.Generator, height: int, width: int) -> Canvas:
 
 
 def painting(rng: np.random.Generator, height: int, width: int) -> Canvas:
-    """Return a landscape or shapes in a wooden frame."""
+    """Return a picture (height, width, 3) of a landscape or shapes in a wooden frame."""
     frame = max(3, min(height, width) // 14)
     out = filled(height, width, wood(rng))
     inner = landscape if rng.random() < 0.6 else abstract
@@ -147,7 +147,7 @@ def painting(rng: np.random.Generator, height: int, width: int) -> Canvas:
 
 
 def board(rng: np.random.Generator, height: int, width: int) -> Canvas:
-    """Return a pin board with sheets on it."""
+    """Return a picture (height, width, 3) of a pin board with sheets on it."""
     out = shaded(filled(height, width, wood(rng)), 1.0 + 0.05 * clouds(rng, height, width, 2.0))
     for _ in range(max(4, height * width // 5000)):
         h = int(rng.uniform(30, 62))
@@ -160,7 +160,7 @@ def board(rng: np.random.Generator, height: int, width: int) -> Canvas:
 
 
 def whiteboard(rng: np.random.Generator, height: int, width: int) -> Canvas:
-    """Return a whiteboard with curves, boxes and words in a few colours."""
+    """Return a picture (height, width, 3) of a whiteboard with curves, boxes and words in a few colours."""
     out = filled(height, width, (238, 240, 238))
     for _ in range(6):
         colour, at = vivid(rng), rng.uniform((10, 10), (max(width - 50, 11), max(height - 40, 11))).astype(int)
@@ -179,7 +179,7 @@ def whiteboard(rng: np.random.Generator, height: int, width: int) -> Canvas:
 
 
 def window(rng: np.random.Generator, height: int, width: int) -> Canvas:
-    """Return a window with a landscape behind it. The landscape is drawn on the wall, so it has no parallax."""
+    """Return a picture (height, width, 3) of a window and the landscape behind it. The picture has no parallax."""
     out = filled(height, width, (225, 228, 228))
     frame, panes = 10, max(1, width // 180)
     view = shaded(landscape(rng, height, width), np.full((height, width), 1.15, dtype=np.float32))
@@ -192,7 +192,7 @@ def window(rng: np.random.Generator, height: int, width: int) -> Canvas:
 
 
 def books(rng: np.random.Generator, height: int, width: int) -> Canvas:
-    """Return shelves of books."""
+    """Return a picture (height, width, 3) of shelves of books."""
     side = wood(rng)
     out = filled(height, width, (int(0.4 * side[0]), int(0.4 * side[1]), int(0.4 * side[2])))
     levels = max(1, round(height / 70.0))
@@ -218,7 +218,7 @@ def books(rng: np.random.Generator, height: int, width: int) -> Canvas:
 
 
 def cupboard(rng: np.random.Generator, height: int, width: int) -> Canvas:
-    """Return a cupboard with doors or drawers, handles and stickers."""
+    """Return a picture (height, width, 3) of a cupboard with doors or drawers, handles and stickers."""
     grain = 1.0 + 0.06 * cv2.resize(clouds(rng, max(height // 12, 2), width, 2.0), (width, height))
     out = shaded(filled(height, width, wood(rng) if rng.random() < 0.7 else pale(rng)), grain.astype(np.float32))
     columns, rows = max(1, round(width / 90.0)), int(rng.integers(1, 5))
@@ -237,14 +237,14 @@ def cupboard(rng: np.random.Generator, height: int, width: int) -> Canvas:
 
 
 def sign(rng: np.random.Generator, height: int, width: int) -> Canvas:
-    """Return a door plate with large print."""
+    """Return a picture (height, width, 3) of a door plate with large print."""
     out = filled(height, width, vivid(rng))
     write(out, rng, (width // 8, height // 5, width, height), max(1, height // 14), PAPER)
     return out
 
 
 def extinguisher(rng: np.random.Generator, height: int, width: int) -> Canvas:
-    """Return a fire extinguisher: a red bottle on a plate."""
+    """Return a picture (height, width, 3) of a fire extinguisher: a red bottle on a plate."""
     out = filled(height, width, PAPER)
     cv2.rectangle(out, (width // 4, height // 3), (3 * width // 4, height - 3), (30, 30, 200), -1)
     cv2.circle(out, (width // 2, height // 3), width // 4, (30, 30, 200), -1, cv2.LINE_AA)

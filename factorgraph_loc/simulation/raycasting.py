@@ -145,7 +145,8 @@ def cast(table: Array, starts: Ints, items: Ints, place: Place, dx: float, dy: f
 
 @compiled(error_model="numpy")
 def cast_all(around: Surroundings, rays: Array) -> Array:
-    """Return the distances (K,) of the hit points of ``rays`` (K, 3), in units of the lengths of the rays, or infinity."""
+    """Return the distances (K,) to the first face that each of ``rays`` (K, 3) hits. The unit of a distance is the
+    length of the ray's vector. It is infinite without a hit."""
     distance = np.empty(len(rays))
     table, starts, items = around.table, around.starts, around.items
     origin, size = around.origin, around.size
@@ -166,7 +167,7 @@ def expose(
     rows: NDArray[np.int16],
     out: NDArray[np.float32],
 ) -> None:
-    """Render an image of the building. At edges of faces, a pixel is the mean of four rays.
+    """Render an image of the building into ``out``. At edges of faces, a pixel is the mean of four rays.
 
     ``texels`` (T, 3), ``layout``: the textures, see :class:`~factorgraph_loc.simulation.renderer.TexturedScene`.
     ``directions`` (H, W, 2): x and y of each pixel's ray at depth 1 in the camera frame. ``rotation`` (3, 3): from
@@ -266,7 +267,7 @@ def _shade(
 def _sample(
     texels: NDArray[np.uint8], first: int, x: float, y: float, width: int, height: int
 ) -> tuple[np.float32, np.float32, np.float32]:
-    """Sample a texture by bilinear interpolation at ``x``, ``y`` texels from its upper left corner. Returns blue, green, red.
+    """Return blue, green and red of a texture at ``x``, ``y`` texels from its upper left corner, interpolated.
 
     ``first``: the index of its first texel in ``texels``. ``width``, ``height``: its size in texels.
     """

@@ -64,8 +64,8 @@ class TexturedScene:
 
 
 def make_scene(plan: Plan, tags: Sequence[Tag], rng: np.random.Generator) -> TexturedScene:
-    """Create the building of a plan, with random textures and random heights of furniture. ``tags`` with a facing are
-    drawn on the surfaces as small labels."""
+    """Return the building of a plan with random textures and random heights of furniture. Those of ``tags`` with a
+    facing (direction of the front) are drawn on the surfaces as small labels."""
     walls, boxes = plan.faces()
     doors = np.array([side for door in plan.doors for side in both_sides(door)]).reshape(-1, 4)
     faces = np.concatenate((walls, boxes, doors))
@@ -119,10 +119,9 @@ def _places(tags: Sequence[Tag], face: Array) -> Iterator[tuple[float, float]]:
 def _stored(
     sizes: Sequence[tuple[int, int]], canvases: Iterable[Canvas]
 ) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-    """Store textures and their mip levels in one array.
+    """Return textures and their mip levels in one array, as ``texels`` and ``layout`` of :class:`TexturedScene`.
 
-    ``sizes``: height and width of each texture. ``canvases``: the textures. Returns ``texels`` and ``layout`` of
-    :class:`TexturedScene`.
+    ``sizes``: height and width of each texture. ``canvases``: the textures.
     """
     layout = np.empty((len(sizes), LEVELS, 3), dtype=np.int64)
     total = 0
@@ -168,7 +167,7 @@ class Renderer:
         gain: float = 1.0,
         rng: np.random.Generator | None = None,
     ) -> Image:
-        """Render a BGR image (H, W, 3).
+        """Return a rendered BGR image (H, W, 3).
 
         ``position``, ``rotation``: the camera pose in the middle of the exposure. ``velocity`` (3,) [m/s], ``turn``
         (3,) [rad/s]: the motion of the camera in the world frame, which blurs the image. ``gain``: factor of the
@@ -187,8 +186,8 @@ class Renderer:
         return np.asarray(raycasting.develop(light, brightness, noise, NORMAL, read, shot))
 
     def hits(self, pixels: Array, position: Array, rotation: Array) -> Array:
-        """Return the points (K, 3) of the scene that are visible at ``pixels`` (K, 2), in the world frame. NaN without
-        a hit."""
+        """Return the points (K, 3) [m] of the scene that are visible at ``pixels`` (K, 2), in the world frame. A point
+        is NaN if nothing is visible."""
         directions = reprojection.undistorted(self.model, np.asarray(pixels, dtype=float).reshape(-1, 2))
         rays = np.column_stack((directions, np.ones(len(directions)))) @ rotation.T
         distance: Array = raycasting.cast_all(self._surroundings(position), rays)

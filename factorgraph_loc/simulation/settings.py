@@ -130,9 +130,8 @@ class SimulationSettings(FileModel):
         return self
 
     def observation_counts(self) -> dict[str, float]:
-        """Return the expected number of simulated observations of each kind of objects (tags, landmarks, points).
-        Raises ValueError if the settings are inconsistent.
-        """
+        """Return {kind of objects (tags, landmarks, points): expected number of simulated observations}. Raises
+        ValueError if the settings are inconsistent."""
         counts: dict[str, float] = {}
         for name, rates in functions("looks", self.rig):
             for what, often in rates(self.model_copy(update={"rig": self.rig.alone(name)})).items():
@@ -200,8 +199,8 @@ EXCLUSIVE = (("tags", "density"), ("antennas", "preset"))  # pairs of keys: a ch
 
 
 def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the nested table ``base`` with the values of ``changes``. A table in ``changes`` with another value of its
-    key ``kind`` replaces the table in ``base``, instead of changing it."""
+    """Return the nested table ``base`` with the values of ``changes``. If a table in ``changes`` has another value of
+    the key ``kind`` than in ``base``, it replaces the whole table."""
     if "kind" in changes and changes["kind"] != base.get("kind"):
         return dict(changes)
     out = dict(base)
@@ -253,10 +252,11 @@ def preset(name: str, changes: Mapping[str, Any] | None = None) -> SimulationSet
 
 
 def read_settings(path: Path, changes: Mapping[str, Any] | None = None) -> SimulationSettings:
-    """Read settings from a TOML file, and apply ``changes``, which are nested tables.
+    """Return the settings in a TOML file. ``changes``: nested tables of values that override those of the file.
 
-    The file changes the settings of a preset. Its key ``preset`` names the preset; the default is ``office``. The key ``rig`` may
-    be the path of a rig file in the folder of the settings file. Raises InputError for a file that is not valid.
+    The file changes the settings of a preset. Its key ``preset`` names the preset; the default is ``office``. The key
+    ``rig`` may be the path of a rig file in the folder of the settings file. Raises InputError if the file is not
+    valid.
     """
     content = read_toml(path)
     base = _preset(content.pop("preset", "office"), path)
@@ -271,7 +271,8 @@ def read_settings(path: Path, changes: Mapping[str, Any] | None = None) -> Simul
 
 
 def named_settings(what: str, changes: Mapping[str, Any] | None = None) -> SimulationSettings:
-    """Return the settings of the preset ``what``, or of the file ``what`` if it ends with ``.toml``. ``changes``: nested tables."""
+    """Return the settings of the preset ``what``, or of the file ``what`` if it ends with ``.toml``. ``changes``:
+    nested tables of values that override these settings."""
     return read_settings(Path(what), changes) if what.endswith(".toml") else preset(what, changes)
 
 

@@ -113,7 +113,7 @@ def _follow(path: Array, heading: float, settings: DriveSettings) -> Trajectory:
 
 
 def simulate(settings: SimulationSettings, seed: int) -> Log:
-    """Simulate a log. The same ``settings`` and ``seed`` give exactly the same log.
+    """Return a simulated log. The same ``settings`` and ``seed`` give exactly the same log.
 
     The log has odometry, RFID reads, and measurements of landmarks and points if the world has such objects. Sensors
     from plugins add their streams. The reference is the true trajectory. The start pose has a random error with the
@@ -142,9 +142,10 @@ def simulate(settings: SimulationSettings, seed: int) -> Log:
 
 
 def simulated(function: Callable[[Ride], Simulated], ride: Ride, name: str) -> Simulated:
-    """Simulate the measurements of the sensor ``name`` on the drive ``ride``, by calling the ``function`` of the sensor's kind.
+    """Return the simulated measurements of the sensor ``name`` on a drive. ``function``: simulates a sensor of this
+    kind. ``ride``: the drive.
 
-    A rig may have several sensors of one kind, with names such as ``camera.front``. Each of them has random generators of its own.
+    If a rig has several sensors of one kind, such as ``camera.front``, each has random generators of its own.
     """
     kind, _, own = name.partition(".")
     if not own:

@@ -52,7 +52,7 @@ class Plan:
         return np.array([*self.walls, *(side for box in self.boxes for side in _sides(box))])
 
     def faces(self) -> tuple[Array, Array]:
-        """Return the faces of walls and the faces of boxes, each as segments (F, 4) with the free side on their left.
+        """Return the faces of walls, then the faces of boxes, each as segments (F, 4) with the free side on their left.
         An inner wall has two faces."""
         walls = np.array([face for wall in self.walls for face in both_sides(wall)]).reshape(-1, 4)
         middles = _places(walls, np.full(len(walls), 0.5))[:, :2]
@@ -80,7 +80,7 @@ def both_sides(segment: Segment) -> tuple[Segment, Segment]:
 
 
 def make_plan(settings: WorldSettings, rng: np.random.Generator) -> Plan:
-    """Return the floor plan named in ``settings``, with random doors and furniture."""
+    """Return a floor plan of the kind named in ``settings``, with random doors and furniture."""
     width, depth = settings.width, settings.depth
     outline = tuple(_sides((0.0, 0.0, width, depth)))
     if settings.plan == "hall":
@@ -144,8 +144,8 @@ def _shelves(width: float, depth: float) -> tuple[Segment, ...]:
 
 
 def _corridors(width: float, depth: float, outline: tuple[Segment, ...], rng: np.random.Generator) -> Plan:
-    """Return an H-shaped plan with a half-turn symmetry: a corridor along x and a corridor across each of its ends. The
-    rest of the building are closed rooms.
+    """Return an H-shaped plan with a half-turn symmetry: a corridor along x and a corridor across each of its ends.
+    Closed rooms fill the rest of the building.
 
     One tag hangs in the middle of the H. Two more tags hang in opposite arms at its ends. As seen from the middle, both
     are on the left or both are on the right. The side is random.
@@ -172,9 +172,9 @@ def _sides(box: Segment) -> list[Segment]:
 
 
 def make_world(settings: WorldSettings, rng: np.random.Generator) -> World:
-    """Return a world with tags ``T000``..., landmarks ``L000``... and points ``P0000``.... Boxes count as walls.
+    """Return a map with tags ``T000``..., landmarks ``L000``... and points ``P0000``.... Boxes count as walls.
 
-    A tag on a surface faces away from the surface. Hanging tags, and tags on the floor at height 0, have no facing.
+    A tag on a surface faces away from the surface. Hanging tags, and tags on the floor at height 0, have no direction.
     Raises InputError if the plan has too few places for the tags.
     """
     plan = make_plan(settings, rng)
