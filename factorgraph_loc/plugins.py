@@ -31,8 +31,8 @@ class Group(Mapping[str, Any]):
     """A registry of plug-ins of one kind. ``group[name]`` imports the plug-in of that name and returns it.
 
     ``kind``: name of the kind, such as "sensors". ``own``: import paths of the built-in plug-ins by name. ``needs``:
-    names of the attributes that a plug-in must have. Getting a plug-in raises InputError if it is of another package
-    and cannot be imported, lacks an attribute, or has a name that is already registered.
+    names of the attributes that a plug-in must have. Getting a plug-in of another package raises InputError if it
+    cannot be imported, lacks an attribute, or has a name that is already registered.
     """
 
     def __init__(self, kind: str, *needs: str) -> None:

@@ -74,8 +74,7 @@ def convert(
 
 
 def manifest(log: str | Path) -> Proposal:
-    """Return a proposed manifest: a TOML file that assigns the files of a folder, or the topics of a ROS bag, to
-    sensors.
+    """Return a proposed manifest. It is a TOML file that assigns files of a folder, or topics of a ROS bag, to sensors.
 
     Write the ``text`` of the proposal to a file in its ``folder``, and check it. Then the file can be given as a log.
     Raises InputError if the folder or the bag cannot be read.

@@ -31,8 +31,8 @@ ADVICE = "`fgloc sensors NAME` prints all keys of a sensor, with bounds."
 class NamedSettings:
     """A reader of logs, a preset of simulations, or a policy of active localization. ``about``: its description.
 
-    ``settings``: the options of the reader, the settings of the preset without those of the rig, or the settings that
-    all policies share.
+    ``settings``: the options of the reader, or the settings of the preset without those of the rig. For a policy, the
+    settings that all policies share.
     """
 
     name: str

@@ -185,14 +185,14 @@ def takes_options(command: Callable[..., None]) -> Callable[..., None]:
 
 
 def parse_list(text: str) -> tuple[str, ...]:
-    """Split a comma-separated list: ``a, b`` becomes ("a", "b")."""
+    """Return the parts of a comma-separated list: ``a, b`` becomes ("a", "b")."""
     return tuple(part.strip() for part in text.split(",") if part.strip())
 
 
 def parse_settings(
     texts: Sequence[str], estimators: Sequence[str], sections: Sequence[str] = ()
 ) -> dict[str, dict[str, Any]]:
-    """Parse the values of ``--set``: ``smoother.lag=10`` becomes {"smoother": {"lag": 10}}.
+    """Return the values of ``--set`` by estimator and key: ``smoother.lag=10`` becomes {"smoother": {"lag": 10}}.
 
     ``estimators``: names of the estimators that are run. ``sections``: other names that a setting may start with.
     Raises InputError if a setting starts with another name.
@@ -215,7 +215,7 @@ def parse_settings(
 
 
 def nested_changes(texts: Sequence[str]) -> dict[str, Any]:
-    """Parse the values of ``--set`` to nested dictionaries: ``a.b=3`` becomes {"a": {"b": 3}}."""
+    """Return the values of ``--set`` as nested dictionaries: ``a.b=3`` becomes {"a": {"b": 3}}."""
     from factorgraph_loc.files.models import set_key
 
     changes: dict[str, Any] = {}
@@ -225,7 +225,7 @@ def nested_changes(texts: Sequence[str]) -> dict[str, Any]:
 
 
 def key_and_value(text: str, option: str) -> tuple[str, Any]:
-    """Parse the value of an option: ``a.b=3`` becomes ("a.b", 3). ``option``: the option that an error names."""
+    """Return the key and the value in ``text``: ``a.b=3`` becomes ("a.b", 3). ``option``: named in errors."""
     key, equals, value = text.partition("=")
     if not equals or not key.strip() or not value.strip() or text != well_formed(text):
         raise InputError(f"{option} is {quoted(text)}, expected KEY=VALUE")

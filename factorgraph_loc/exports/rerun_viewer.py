@@ -29,7 +29,7 @@ def open_viewer(bind: str) -> Iterator[str]:
     open.
 
     A new viewer listens on the IP address ``bind`` and stays open after the end of this process. Raises InputError if
-    ``bind`` is no IP address, if the viewer does not start, or if it is closed before the end of the block.
+    ``bind`` is no IP address, or if the viewer does not start or is closed during the block.
     """
     host = _reachable(bind)
     url = f"rerun+http://{f'[{host}]' if ':' in host else host}:{PORT}/proxy"

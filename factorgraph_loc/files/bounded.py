@@ -48,10 +48,10 @@ class NoFileNameError(InputError):
 
 
 def kind(path: Path, source: object = None) -> str:
-    """Return the kind of a path: "a file", "a folder", "a named pipe", "a socket", "a device", or "" if nothing exists there.
+    """Return the kind of a path, such as "a file", "a folder", "a named pipe", or "" if nothing exists there.
 
-    ``source``: the file or option that contains the path, for messages. Raises NoFileNameError if no file can have
-    this name, and InputError if access is denied.
+    ``source``: the file or option that contains the path, for messages. Raises NoFileNameError if no file can have this
+    name, and InputError if access is denied.
     """
     try:
         return _kind(path.stat())

@@ -83,8 +83,8 @@ class Cells:
     def stamps(self, name: str, offset: float = 0.0) -> Integers:
         """Return the timestamps (N,) [ns] in a field, plus ``offset`` [s].
 
-        The unit of the field is s, ms, us, ns or iso: a date and time, which is UTC if it has no time zone. Raises
-        InputError for other units, invalid cells, and timestamps that are too far apart.
+        The unit of the field is s, ms, us, ns or iso. The unit iso means a date and time, in UTC if without a time
+        zone. Raises InputError for other units, invalid cells, and timestamps that are too far apart.
         """
         return self._of_one_log(self._known(self._stamps(name, offset)))
 
@@ -265,7 +265,7 @@ def _limited(stamp: int) -> int:
 
 
 def iso_nanoseconds(text: str) -> int:
-    """Convert an ISO 8601 date and time to nanoseconds since 1970. A time without a time zone is UTC.
+    """Return an ISO 8601 date and time in nanoseconds since 1970. A time without a time zone is UTC.
 
     Raises ValueError if the text is invalid.
     """

@@ -54,10 +54,10 @@ def increments_in_order(
 ) -> tuple[Integers, Array]:
     """Return the distinct timestamps (M,) [ns] of odometry increments, and the increments (M, 3 or 4).
 
-    ``moves`` (N, 3 or 4): the motion (x, y, heading) [m, m, rad] since the previous row, in the body frame of that row.
-    The optional fourth column is the part [s] of this time without odometry. Increments with equal timestamps ``t_ns``
-    (N,) are composed, with a warning in ``warnings``. ``rows`` (N,): row numbers in the file ``source``. Raises
-    InputError if the timestamps decrease.
+    ``moves`` (N, 3 or 4): x, y [m] and heading [rad] since the previous row, in the body frame of that row. The
+    optional fourth column is the part [s] of this time without odometry. Increments with equal timestamps ``t_ns`` (N,)
+    are composed, with a warning in ``warnings``. ``rows`` (N,): row numbers in the file ``source``. Raises InputError
+    if the timestamps decrease.
     """
     _require_order(source, rows, t_ns, rules)
     last, out = composed(t_ns, moves[:, :3])

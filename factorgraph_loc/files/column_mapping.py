@@ -220,7 +220,7 @@ def text_of_hex(digits: str) -> str:
 
 
 def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]) -> Cells:
-    """Read the columns of a CSV file that ``mapping`` assigns to fields, in the rows that ``where`` selects.
+    """Return the columns of a CSV file that ``mapping`` assigns to fields, in the rows that ``where`` selects.
 
     Raises InputError if all columns of one entry of ``needed`` are missing."""
     numbered = [(row, line) for row, line in enumerate(read_text(path).splitlines(), start=1) if line.strip()]
@@ -348,7 +348,7 @@ def _wrong_value(path: Path, row: int, entry: Mapping[str, Any], fields: Sequenc
 
 
 def _text(value: Any) -> str:
-    """Convert a value of JSON or TOML to the text that a cell of CSV would have. None becomes ""."""
+    """Return a value of JSON or TOML as the text that a cell of CSV would have. None becomes ""."""
     if isinstance(value, bool):
         return str(value).lower()
     return "" if value is None else well_formed(str(value))

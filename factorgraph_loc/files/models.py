@@ -219,7 +219,7 @@ def known_keys(kind: type[BaseModel], path: tuple[int | str, ...]) -> list[str]:
 
 
 def nearest(word: str, known: list[str]) -> str:
-    """Return the end of a message about an unknown ``word``: the most similar known word, or else a list of all known words."""
+    """Return the end of a message about an unknown ``word``: the most similar known word, or else all known words."""
     if matches := similar(word, known):
         return f": did you mean {plain(matches[0])}?"
     return f"; known: {listed(sorted(known), 2 * LISTED)}" if known else ""
@@ -234,7 +234,7 @@ def similar(word: str, known: list[str]) -> list[str]:
 def set_key(content: dict[str, Any], key: str, value: Any, source: object) -> None:
     """Set the value at ``key``, a path such as ``a.b.c``, in the nested tables ``content``. Missing tables are created.
 
-    Raises InputError, with the file ``source``, if a part of the path is not a table, or if there are too many parts.
+    Raises InputError, with the file ``source``, if a part of the path is not a table or the path is too long.
     """
     *tables, last = key.split(".")
     if len(tables) >= DEEPEST:
@@ -283,7 +283,8 @@ def inside(root: Path, name: str, source: object, *others: Path, expected: str =
 
 
 def file_name(name: str) -> str:
-    """Convert a name to a file name. Characters other than letters, digits, dots, dashes and underscores become underscores.
+    """Return a name as a file name. Characters other than letters, digits, dots, dashes and underscores become
+    underscores.
 
     Names above :data:`LONGEST_FILE` bytes are truncated and end with a hash of the whole name.
     """

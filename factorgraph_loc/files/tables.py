@@ -43,10 +43,11 @@ def csv_rows(path: Path, lines: Sequence[tuple[int, str]], **form: Any) -> Itera
 def rows_of_length(
     path: Path, header: Sequence[str], rows: Iterable[tuple[int, list[str]]], rules: RowRules | None = None
 ) -> tuple[Integers, dict[str, list[str]], tuple[tuple[int, str], ...]]:
-    """Collect the rows of a CSV file by column. ``rows``: line number and cells of each row.
+    """Return the rows of a CSV file by column. ``rows``: line number and cells of each row.
 
-    Returns the line numbers (N,), the N cells of each column by its name in ``header``, and line number and error of
-    each row with a wrong number of cells. Raises InputError at the first such row unless ``rules`` skip it.
+    The results are the line numbers (N,), the N cells of each column by its name in ``header``, and the rejected rows.
+    A rejected row has a wrong number of cells, and is given as line number and error. Raises InputError at the first
+    such row unless ``rules`` skip it.
     """
     numbers: list[int] = []
     table: list[list[str]] = []

@@ -237,7 +237,7 @@ def _guess_fields(out: Guess) -> Guess:
 
 
 def _split(name: str) -> tuple[str, str]:
-    """Split the name of a column into the name without its unit, and the unit in lower case. The unit is "" if there is none."""
+    """Return the name of a column without its unit, and the unit in lower case, "" if there is none."""
     if bracket := BRACKETS.search(name):
         return name[: bracket.start()], bracket[1].lower()
     words = WORDS.findall(name)

@@ -93,8 +93,8 @@ def between_poses(
     """Return the motions (N - 1, 3) between odometry poses: x, y [m] and heading [rad] in the earlier body frame.
 
     ``poses`` (N, 3): x, y, heading. ``t_ns`` (N,): their timestamps. At a reset of the odometry to the origin, the
-    motion before it is repeated, and a warning that names the file ``source`` is appended to ``warnings``. ``lost_ns``:
-    timestamps at which the device had no pose.
+    motion before it is repeated. Then a warning about ``source`` is appended to ``warnings``. ``lost_ns``: timestamps
+    at which the device had no pose.
     """
     moves = se2.between(poses[:-1], poses[1:])
     durations = _durations(t_ns)
@@ -146,7 +146,7 @@ def integrate_velocities(t_ns: Integers, velocities: Array) -> Array:
 
 
 def with_start_row(moves: Array) -> Array:
-    """Return ``moves`` (N - 1, 3) with a row of zeros in front (N, 3), so that each of N timestamps has a row."""
+    """Return ``moves`` (N - 1, 3) with a row of zeros in front (N, 3), the motion at the first timestamp."""
     return np.vstack((np.zeros((1, 3)), moves))
 
 
@@ -168,7 +168,7 @@ def wheel_motions(source: object, t_ns: Integers, distances: Array, scales: Arra
 def motion_of_wheel_distances(
     source: object, t_ns: Integers, distances: Array, scales: Array, sizes: WheelSizes, warnings: list[Notice]
 ) -> Array:
-    """Return the motions (N - 1, 3) of a robot from its wheels: x, y [m] and heading [rad] in the earlier body frame.
+    """Return the motions (N - 1, 3) of a robot: x, y [m] and heading [rad] in the earlier body frame.
 
     ``distances`` (N, W): total distances [m] of W = 2 or 4 wheels (left, right, rear left, rear right) at N timestamps.
     ``scales`` (W,): metres per encoder count. Warnings about the file ``source`` are appended to ``warnings``.

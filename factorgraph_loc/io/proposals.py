@@ -37,8 +37,8 @@ def proposal_of(
 ) -> Proposal:
     """Return a proposed manifest of the log at ``path``. A manifest is a TOML file that describes how to read a log.
 
-    ``reader``, ``options``: the reader of the log and its options. ``folder``: the folder to save the manifest in if
-    the log is below it, else the folder that contains the log is used. A rig file and a world file next to the log are
+    ``reader``, ``options``: the reader of the log and its options. ``folder``: the folder to save the manifest in. If
+    the log is not below it, the folder that contains the log is used. A rig file and a world file next to the log are
     named in the manifest. If one is missing, a remark asks for it. ``with_map``: False if ``options`` describe the map,
     so that no world file is needed.
     """

@@ -32,8 +32,8 @@ class Estimates:
     """The estimated poses of a stored run: causal ones, which use earlier measurements only, or final ones, which use
     the whole log.
 
-    ``trajectory``: N estimated poses. ``errors``: by the names in :data:`ERRORS`, the errors of position (N,) [m] and
-    heading (N,) [rad], and the normalised estimation error squared (N,). An unknown error is NaN.
+    ``trajectory``: N estimated poses. ``errors``: arrays (N,) by the names in :data:`ERRORS`: the errors of position
+    [m] and heading [rad], and the normalised estimation error squared. An unknown error is NaN.
     """
 
     trajectory: Trajectory

@@ -75,8 +75,8 @@ def write_trajectory(trajectory: Trajectory | PosePath, path: str | Path, t0_ns:
     """Write a trajectory in TUM format, or in KITTI format if ``path`` ends with .kitti. Returns the written files.
 
     ``t0_ns``: the absolute time [ns] of t = 0 of a planar trajectory, for TUM format. In KITTI format, times [s] since
-    t = 0 are written to ``NAME.times.txt``. Poses in KITTI format are poses of the robot (x forward, z up), not of a
-    camera, and not relative to the first pose.
+    t = 0 are written to ``NAME.times.txt``. Its poses are those of the robot (x forward, z up) in the frame of
+    ``trajectory``, not of a camera.
     """
     path = Path(path)
     if path.suffix != ".kitti":

@@ -90,12 +90,11 @@ class Localizer:
         ``pose`` (3,): x, y [m] and heading [rad] in the world frame. None starts at an unknown pose in the map. A NaN
         heading is unknown; the status is then not ``localized`` until measurements determine the heading.
         ``covariance`` (3, 3) of the pose, or (2, 2) of the position if the heading is NaN. The default has standard
-        deviations of 0.05 m and 0.05 rad.
-        ``t``: time of the pose [s], by default the time of the first measurement. Of the measurements before ``t``,
-        only the last velocity of the odometry is used.
+        deviations of 0.05 m and 0.05 rad. ``t``: time of the pose [s], by default the time of the first measurement. Of
+        the measurements before ``t``, only the last velocity of the odometry is used.
 
-        Raises InputError if an argument is invalid or if the estimator does not support an unknown pose, and
-        RunFailedError if it cannot start at the pose. The previous state is kept in both cases.
+        Raises InputError if an argument is invalid or if the estimator does not support an unknown pose. Raises
+        RunFailedError if the estimator cannot start at the pose. The previous state is kept in both cases.
         """
         start = None if pose is None else prior_of(pose, covariance, t)
         setup = model_setup.Setup(self._rig, self._world, self._sensors, np.random.default_rng(self._seed))

@@ -155,10 +155,10 @@ class Bag:
         self.duration = 0.0 if reader.start_time == NO_FILE else max(reader.end_time - 1 - reader.start_time, 0) / 1e9
 
     def topic(self, name: str, *types: str) -> Topic:
-        """Return the topic ``name``.
+        """Return the topic ``name``. ``types``: the accepted message types; if none is given, any type is accepted.
 
-        Raises InputError if the bag lacks the topic, if it has no messages or messages of several types, or if its type
-        is not among ``types``. Without ``types``, any type is accepted.
+        Raises InputError if the bag lacks the topic, if its type is not accepted, or if it has no messages. Raises
+        InputError also if it has messages of several types.
         """
         if name not in self.topics:
             raise InputError(f"{self.path}: has no topic {quoted(name)}{nearest(name, list(self.topics))}")

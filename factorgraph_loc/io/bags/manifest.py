@@ -305,7 +305,7 @@ def _custom(out: Uses, bag: Bag, topics: Sequence[Topic]) -> list[tuple[Topic, l
 
 
 def _rfid(out: Uses, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
-    """Add the topic of RFID reads to ``out``: the topic with a field for the EPC and with most other fields of a read.
+    """Add the topic of RFID reads to ``out``. It has a field for the EPC and the most other fields of a read.
 
     ``custom``: unused topics with message types that do not come with ROS, and the paths of their fields."""
     reads = [(topic, read_fields(paths)) for topic, paths in custom if not range_fields(paths)]
@@ -336,8 +336,8 @@ def _rfid(out: Uses, custom: Sequence[tuple[Topic, Sequence[str]]]) -> None:
 def _ranges(out: Uses, custom: Sequence[tuple[Topic, Sequence[str]]]) -> dict[str, dict[str, Any]]:
     """Return the proposed settings of each topic with ranges to landmarks, by the name of the topic.
 
-    Such a topic has a field for a distance, and in the same part of the message a field for the name of a landmark.
-    ``custom``: unused topics with message types that do not come with ROS, and the paths of their fields."""
+    Such a topic has fields for a distance and for the name of a landmark, in the same part of the message. ``custom``:
+    unused topics with message types that do not come with ROS, and the paths of their fields."""
     candidates = {t.name: fields for t, paths in custom if t.name not in out.uses and (fields := range_fields(paths))}
     out.remarks += [
         f"{topic} is read as ranges [m] to landmarks of the map; {fields['landmark']} has the name of the landmark"

@@ -116,10 +116,10 @@ def checked_rotations(source: str, rows: Integers, table: Array) -> Array:
 def path_of(rows: TopicRows, warnings: list[Notice], *, has_rotations: bool = True) -> PosePath:
     """Return the poses in ``rows``, which were collected from a topic.
 
-    The columns are x, y, z [m], a quaternion x, y, z, w unless ``has_rotations`` is False, and optionally the variances
-    of x and y. Null poses, which a device reports while it has lost its pose, are skipped with a warning in
-    ``warnings``. Of rows with equal timestamps, the last is used. Raises InputError, with the number of the message, at
-    an invalid row.
+    The columns are x, y, z [m], then the quaternion x, y, z, w, and optionally the variances of x and y.
+    ``has_rotations``: False if there is no quaternion. Null poses, which a device reports while it has lost its pose,
+    are skipped with a warning in ``warnings``. Of rows with equal timestamps, the last is used. Raises InputError, with
+    the number of the message, at an invalid row.
     """
     source, values = rows.source, rows.values
     if not has_rotations:

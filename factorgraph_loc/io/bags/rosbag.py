@@ -57,8 +57,8 @@ FRAMES, WITHIN = ":", "."  # /tf:PARENT.CHILD
 def camera_of(info: Info, frames: StaticFrames, notes: list[Notice]) -> CameraSettings:
     """Return the settings of a camera. ``info``: its CameraInfo. ``frames``: the static transforms of the bag.
 
-    If the transforms lack the frame of the camera, it is mounted at the robot's origin and points forward, and a note
-    for the user is appended to ``notes``.
+    If the transforms lack the camera, it is at the robot's origin and points forward. Then a note is appended to
+    ``notes``.
     """
     pose = frames.pose(info.frame)
     if pose is None:
@@ -124,7 +124,7 @@ add_fields(
 
 
 def read(path: Path | None, options: Options) -> Log:
-    """Read the log in a bag. Its t = 0 is the time of the first odometry message.
+    """Return the log in the bag ``path``. Its t = 0 is the time of the first odometry message.
 
     Raises InputError with the bag, topic, message and field of an invalid value.
     """

@@ -59,7 +59,7 @@ class RunFile(RowRules):
 
 
 def read(path: Path | None, options: Options) -> Log:  # noqa: ARG001 - every reader takes options
-    """Read a log in the native format from the folder ``path``. Its t = 0 is the first timestamp of the tables.
+    """Return the log in the native format in the folder ``path``. Its t = 0 is the first timestamp of the tables.
 
     Raises InputError with file, row and field of an invalid value.
     """

@@ -50,7 +50,7 @@ def default_rig(streams: Iterable[str]) -> Rig:
 
 
 def read_rig(path: str | Path) -> Rig:
-    """Read a rig, the settings of a robot and its sensors, from ``NAME.rig.toml`` and the files that it names.
+    """Return the rig, the settings of a robot and its sensors, in ``NAME.rig.toml`` and the files that it names.
 
     Raises InputError with the file, the key and the expected value.
     """

@@ -21,7 +21,7 @@ class _Markers(FileModel):
 
 
 def read_world(path: str | Path) -> World:
-    """Read a map from ``NAME.world.toml``. Raises InputError with the file, the key and the expected value."""
+    """Return the map in ``NAME.world.toml``. Raises InputError with the file, the key and the expected value."""
     path = Path(path)
     return parse_world(read_toml(path), path, path.parent)
 

@@ -77,11 +77,10 @@ def load(
     """Return the logs that ``log`` refers to.
 
     ``log``: a manifest, a folder in the native format or its ``run.toml``, the name of a shipped data set, or a
-    ``Log``, which is returned. With ``reader``, any path that the reader can read.
-    ``options``: options of the reader, overriding the manifest. A list, or a text with commas, gives one log
-    per value. ``rig``, ``world``: values or files that replace the rig and the world of the log.
-    ``data_root``: the folder of data sets; by default the environment variable FGLOC_DATA.
-    Raises InputError with a message of one line about what is invalid.
+    ``Log``. With ``reader``, any path that the reader can read. ``options``: options of the reader, overriding the
+    manifest. A list, or a text with commas, gives one log per value. ``rig``, ``world``: values or files that replace
+    the rig and the world of the log. ``data_root``: the folder of data sets; by default the environment variable
+    FGLOC_DATA. Raises InputError with a message of one line about what is invalid.
     """
     if isinstance(log, Log):
         return [replace(log, rig=_value(rig, read_rig) or log.rig, world=_value(world, read_world) or log.world)]

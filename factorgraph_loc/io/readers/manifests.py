@@ -72,7 +72,7 @@ class Dataset:
 
 
 def read_manifest(file: Path) -> Manifest:
-    """Read a manifest. Raises InputError with the file, the key and the expected value."""
+    """Return the manifest in ``file``. Raises InputError with the file, the key and the expected value."""
     return parse_model(Manifest, read_toml(file), file)
 
 

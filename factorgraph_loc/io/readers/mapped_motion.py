@@ -69,7 +69,7 @@ def read_odometry(folder: TableFolder, options: OdometryFile) -> tuple[Integers,
     """Return the timestamps (N,) [ns] of the odometry, and its velocities (N, 2) or increments (N, 3 or 4).
 
     A velocity is forward [m/s] and turn rate [rad/s]. An increment is x, y [m] and heading [rad] since the previous
-    timestamp, and optionally the part [s] of that time with lost poses. Raises InputError with file and row of an
+    timestamp. Its optional fourth column is the time [s] with lost poses. Raises InputError with file and row of an
     invalid value.
     """
     path, warnings = folder.file(options.file), folder.warnings

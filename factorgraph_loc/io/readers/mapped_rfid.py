@@ -44,10 +44,11 @@ STANDARD = str.maketrans("-_", "+/")  # converts URL-safe base64 to standard bas
 
 
 def read_wide(path: Path, mapping: ColumnMapping, antenna: str | None) -> Cells:
-    """Return the reads of a table with several columns of signal strengths, whose names match a pattern such as ``rssi_*``.
+    """Return the reads of a table with several columns of signal strengths, whose names match a pattern such as
+    ``rssi_*``.
 
-    Each cell that is not empty is a read. The text in place of ``*`` is the EPC of the tag if the antenna is known, or
-    else the name of the antenna. The antenna is known if ``columns`` has it, or if ``antenna``, the name of the only
+    Each cell that is not empty is a read. The text in place of ``*`` is the name of the antenna, or the EPC of the tag
+    if the antenna is known. The antenna is known if ``columns`` has it, or if ``antenna``, the name of the only
     antenna, is given. Raises InputError at an invalid value.
     """
     pattern = mapping.columns["rssi"]
@@ -95,8 +96,8 @@ def presets() -> dict[str, dict[str, dict[str, str]]]:
 class RfidFile(TimedMapping, ReadNames):
     """A table of RFID reads. ``columns`` maps t, epc or epc_base64, antenna, rssi, phase, and frequency or channel.
 
-    A ``*`` in the column of rssi matches several columns, one for each tag or antenna. If a row summarizes several
-    reads, t is the time of the first one, ``last`` is the time of the last one, and ``count`` is their number.
+    A ``*`` in the column of rssi matches several columns, one for each tag or antenna. A row may summarize several
+    reads. Then t and ``last`` are the times of the first and the last read, and ``count`` is their number.
     """
 
     columns: dict[str, str] = Field(default_factory=dict)
@@ -139,7 +140,7 @@ def read_all_reads(folder: TableFolder, options: RfidFile) -> TableRows:
 
 
 def joined(path: Path, tables: Sequence[TableRows]) -> TableRows:
-    """Join tables of RFID reads to one table, sorted by time. ``path``: the name of the joined table in errors."""
+    """Return all rows of several tables of RFID reads, sorted by time. ``path``: the name of the result in errors."""
     reads = _concatenated(path, tables)
     return reads.rows_at(np.argsort(reads.t_ns, kind="stable"))
 
@@ -260,10 +261,10 @@ def _frequencies(mapped: Cells, channels: tuple[float, ...] | Channels | None) -
 
 
 def _with_last(table: TableRows, mapped: Cells, options: RfidFile, warnings: list[Notice]) -> TableRows:
-    """Return ``table`` with an additional read at the end of each row that summarizes several reads.
+    """Return ``table`` with one more read for each row that summarizes several reads.
 
-    The additional read has the timestamp of the last read and no measured values. Reads between the first and the last
-    have no timestamps; a warning about them is appended to ``warnings``."""
+    This read has the timestamp of the last read and no measured values. A warning about the reads between the first and
+    the last, which have no timestamps, is appended to ``warnings``."""
     if "last" not in mapped.columns:
         if "count" in mapped.columns and (many := int(np.count_nonzero(mapped.numbers("count", COUNT) > 1.0))):
             sentence = "{source}: {rows} rows summarize several reads with one timestamp: each counts as one read"

@@ -43,7 +43,7 @@ class Options(FileModel):
 
 
 def read(path: Path | None, _options: Options) -> Log:
-    """Read a log from a PyFactorGraph file. Its t = 0 is the time of the first pose.
+    """Return the log in a PyFactorGraph file. Its t = 0 is the time of the first pose.
 
     Raises InputError at an invalid value, and at a row that does not belong to a single robot in the plane.
     """
