@@ -153,8 +153,9 @@ def solved(system: System, damping: float) -> tuple[bool, Array, Array]:
 
 @compiled
 def covariances(system: System) -> tuple[bool, Array, Array]:
-    """Invert the equations ``system``. Returns True if the poses are determined, the covariances of the poses (N, 3,
-    3), and the covariance of the parameters (P, P). Raises LinAlgError if the parameters are not determined."""
+    """Invert the information matrix of the normal equations ``system``. Returns True if the poses are determined, the
+    covariances of the poses (N, 3, 3), and the covariance of the parameters (P, P). Raises LinAlgError if the
+    parameters are not determined."""
     solvable, out, by_next, by_side, left = _eliminated(system, 0.0)
     shared = len(left) - 1
     if not solvable:

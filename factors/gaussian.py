@@ -83,7 +83,7 @@ def _substitute(upper: Array, out: Array) -> None:
 
 @compiled
 def put(matrix: Array, out: Array) -> None:
-    """Copy a matrix (M, N) into the first rows and columns of ``out``."""
+    """Copy a matrix (M, N) into the first M rows and N columns of ``out``, in place."""
     for i in range(matrix.shape[0]):
         for j in range(matrix.shape[1]):
             out[i, j] = matrix[i, j]

@@ -14,11 +14,12 @@ from factors.se2 import Array
 
 
 class SightingFactor(Protocol):
-    """The interface of a factor with K sightings that were measured at one time, such as the ranges and bearings of K
-    landmarks. Each sighting has g coordinates."""
+    """The interface of a factor with K sightings, which are measured objects with g coordinates each. All are measured
+    at one time, such as the ranges and bearings of K landmarks."""
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Return the residual (K, g), and its Jacobian (K, g, d) with respect to each value. All are whitened."""
+        """Return the whitened residual (K, g), and a list of its Jacobians (K, g, d), one for each of ``values``
+        (d,)."""
 
     def weight(self, squared: Array) -> Array:
         """Return the robust weights (K,) for ``squared`` (K,), the squared norms of whitened residuals."""

@@ -95,8 +95,8 @@ def learn(
 
 
 def sensing(rig: Rig, log: Log) -> Rig:
-    """Return a copy of ``rig`` for a log. Its list ``sensors`` has the exteroceptive sensors with measurements in the
-    log, and all other sensors of ``rig.sensors``."""
+    """Return a copy of ``rig`` for a log. In its list ``sensors``, exteroceptive sensors without measurements in the
+    log are removed, and those with measurements are added."""
     sensed = senses(rig)
     kept = [name for name in rig.sensors if name not in sensed or name in log.streams]
     added = [name for name in sensed if name in log.streams and name not in kept]

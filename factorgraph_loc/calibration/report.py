@@ -95,7 +95,8 @@ def summary(calibration: Calibration) -> list[str]:
 
 
 def document(calibration: Calibration) -> dict[str, Any]:
-    """Return the report as a dictionary of values for JSON."""
+    """Return the report as a dictionary for JSON. Its keys include ``constants``, ``held_out`` (scores), ``refused``,
+    ``rig``."""
     wanted = [f"{kind}.{figure}" for kind in KINDS for figure, _ in FIGURES.values()]
     return {
         "logs": list(calibration.logs),

@@ -175,7 +175,7 @@ class _ClosedLoop:
         self._targets = ((space.centres[np.unique(nearest_cells)], TAGS), (waypoints(space, WAYPOINTS), PLACES))
 
     def run(self) -> bool:
-        """Run to the end. Returns True if the robot was localized correctly."""
+        """Run until the robot is localized or reaches a limit. Returns True if the robot was localized correctly."""
         robot, settings = self.robot, self._settings
         done = self._take(robot.begin())
         while not done and robot.metres < settings.max_metres - 1e-3 and robot.t < settings.max_seconds:

@@ -116,7 +116,7 @@ def particle_entropy(poses: Array, weights: Array, dims: int = POSE) -> float:
 
 def has_several_modes(poses: Array, weights: Array) -> bool:
     """True if particles ``poses`` (M, 3) with ``weights`` (M,) are poorly described by a Gaussian. Either their heading
-    is unknown, or they have less entropy than a Gaussian with their covariance, by more than :data:`SEVERAL`."""
+    is unknown, or a Gaussian with their covariance has more entropy, by more than :data:`SEVERAL`."""
     _, covariance = pose_moments(poses, weights)
     if covariance[2, 2] > WIDEST_HEADING**2:
         return True

@@ -51,11 +51,11 @@ def station_poses(
 
 @compiled
 def covariances(poses: Array, index: Places, weights: Array32, out: Array) -> None:
-    """Compute J weighted covariances of M particles.
+    """Compute J weighted covariances of (x, y, heading) of M particles.
 
-    ``poses`` (S, M, 3): the particles at S stations. ``index`` (J,): the station of each covariance. ``weights`` (J,
-    M): the weights for each covariance. ``out`` (J, 3, 3): receives the covariances. Headings are computed relative to
-    the first particle's.
+    ``poses`` (S, M, 3): the particles at S stations, the points of a path at which the belief is evaluated. ``index``
+    (J,): the station of each covariance. ``weights`` (J, M): the weights of the particles for each covariance. ``out``
+    (J, 3, 3): output. Headings are computed relative to the heading of the first particle.
     """
     count = poses.shape[1]
     d = np.empty(3)
@@ -85,8 +85,8 @@ def covariances(poses: Array, index: Places, weights: Array32, out: Array) -> No
 def cell_entropies(poses: Array, index: Places, weights: Array32, cell: Array, dims: int, out: Array) -> None:
     """Compute J entropies [nats] of histograms of M particles.
 
-    ``cell`` (3,): the size of a cell in x, y and heading. ``dims``: the number of leading coordinates that are
-    considered. ``out`` (J,): receives the entropies. Other arguments: see :func:`covariances`.
+    ``poses``, ``index``, ``weights``: as in :func:`covariances`. ``cell`` (3,): the size of a cell in x, y and heading.
+    ``dims``: the number of leading coordinates that are considered. ``out`` (J,): output.
     """
     stations, count, _ = poses.shape
     volume = 0.0

@@ -200,7 +200,8 @@ paper_literal = partial(information, sign=-1.0)
 
 
 def policy(name: str) -> Policy:
-    """Return the policy with this name. Raises InputError for an unknown name."""
+    """Return the policy with this name, a function of a :class:`Situation` that returns a :class:`Choice`. Raises
+    InputError for an unknown name."""
     if name not in POLICIES:
         raise InputError(f"policy {quoted(name)} is not known{nearest(name, list(POLICIES))}")
     chosen: Policy = load(f"{__name__}:{name}")

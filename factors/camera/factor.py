@@ -82,8 +82,8 @@ class ReprojectionFactor:
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Return the whitened residual (2K,) of K pixels and its Jacobian (2K, d) by each variable of size d.
-        ``values``: the variables, as in the class docstring. Residual and Jacobians include robust weights and
-        tempering. Their noise includes the variances of the robot's roll and pitch."""
+        ``values``: the pose (3,), then the estimated constants and displacements, see the class. Residual and Jacobians
+        include robust weights and tempering. Their noise includes the variances of the robot's roll and pitch."""
         if self.of_pose_alone:
             residual, jacobian = pixel_kernels.linearized(self.packed(), np.ascontiguousarray(values[0], dtype=float))
             return residual, [jacobian]
@@ -95,15 +95,15 @@ class ReprojectionFactor:
 
     def cost(self, values: Sequence[Array]) -> float:
         """Return the robust loss for the best-fitting roll and pitch, multiplied by the tempering exponent. ``values``:
-        the variables, as in the class docstring."""
+        the pose (3,), then the estimated constants and displacements, see the class."""
         error, tilt = self.levelled(values)
         loss = np.sum(huber_loss(np.sum(error**2, axis=-1), self.model.robust)) + 0.5 * tilt @ tilt
         return self.model.tempering * float(loss)
 
     def levelled(self, values: Sequence[Array]) -> tuple[Array, Array]:
-        """Fit roll and pitch to the K pixels of the image. ``values``: the variables, as in the class docstring.
-        Returns the whitened residual (K, 2) after the fit, and roll and pitch (2,) in units of their prior standard
-        deviation."""
+        """Fit roll and pitch to the K pixels of the image. ``values``: pose, constants and displacements, see the
+        class. Returns the whitened residual (K, 2) after the fit, and roll and pitch (2,) in units of their prior
+        standard deviation."""
         error, (*_, by_tilt) = self.whitened(values)
         roll, pitch, _ = pixel_kernels.tilted(error, np.ascontiguousarray(by_tilt), float(self.model.robust))
         tilt = np.array((roll, pitch))
@@ -117,9 +117,9 @@ class ReprojectionFactor:
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Return the whitened residual (K, 2) of a level robot, predicted minus measured, and a list of Jacobians.
 
-        ``values``: the variables, as in the class docstring. The list has the Jacobian (K, 2, d) by each variable of
-        size d. Its last element is the Jacobian (K, 2, 2) by roll and pitch in units of their prior standard deviation.
-        Robust weights are not included.
+        ``values``: the pose (3,), then the estimated constants and displacements, see the class. The list has the
+        Jacobian (K, 2, d) by each variable of size d. Its last element is the Jacobian (K, 2, 2) by roll and pitch in
+        units of their prior standard deviation. Robust weights are not included.
         """
         moved_by, displacements = np.array(self.moved_by, dtype=np.int64), values[1 + bool(self.estimated) :]
         moves = None if not self.moved_by else np.array((*displacements, np.zeros(3)))[moved_by]

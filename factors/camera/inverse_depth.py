@@ -107,11 +107,12 @@ def begin(
 
 
 def linearity(rays: Array, sigmas: Array, position: Array) -> Array:
-    """Return an index (K,) of how far the x, y, z of K points are from a Gaussian (section VI of the source).
+    """Return the linearity index (K,) of Civera et al. (section VI), which is small if x, y, z of a point are nearly
+    Gaussian.
 
     ``rays`` (K, 6): x, y, z of the start, azimuth, elevation, and inverse depth of each point. ``sigmas`` (K,):
-    standard deviations of the inverse depths. ``position`` (3,): the position of the camera. If the index is below
-    :data:`LINEAR`, x, y, z can replace the ray. It is infinite if the inverse depth is not positive.
+    standard deviations of the inverse depths. ``position`` (3,): the camera's position in the world. If the index is
+    below :data:`LINEAR`, x, y, z can replace the ray. It is infinite if the inverse depth is not positive.
     """
     inverse = rays[:, 5]
     index = np.full(len(rays), np.inf)

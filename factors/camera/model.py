@@ -79,7 +79,7 @@ class CameraModel:
         return np.array((self.fx, self.fy, self.cx, self.cy, *self.distortion, *((1.0,) if self.fisheye else ())))
 
     def matrix(self) -> Array:
-        """The camera matrix (3, 3)."""
+        """Return the camera matrix (3, 3), made of focal lengths and principal point [px]."""
         return np.array(((self.fx, 0.0, self.cx), (0.0, self.fy, self.cy), (0.0, 0.0, 1.0)))
 
     @property
@@ -88,7 +88,8 @@ class CameraModel:
         return len(self.distortion) == 4 and not self.fisheye
 
     def calibration(self) -> gtsam.Cal3DS2:
-        """The calibration for GTSAM. The lens must have Brown's distortion, see :attr:`is_brown`."""
+        """Return focal lengths, principal point and distortion as a GTSAM object. The lens must satisfy
+        :attr:`is_brown`."""
         return gtsam.Cal3DS2(self.fx, self.fy, 0.0, self.cx, self.cy, *self.distortion)
 
     def contains(self, pixels: Array, margin: float = 0.0) -> Any:

@@ -43,16 +43,16 @@ class PointFactor:
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Return the whitened residual (2,) with robust weight, and its Jacobian (2, d) by each variable of size d.
-        ``values``: the variables, as in the class docstring. If the point is behind the camera, the residual is
-        constant and the Jacobian is zero."""
+        ``values``: pose, estimated constants, roll and pitch, and point, see the class. If the point is behind the
+        camera, the residual is constant and the Jacobian is zero."""
         residuals, blocks = self.linearize_all([self], [values])
         return residuals[0], [block[0] for block in blocks]
 
     @staticmethod
     def linearize_all(factors: Sequence[PointFactor], values: Sequence[Sequence[Array]]) -> tuple[Array, list[Array]]:
-        """Linearise N factors of one camera. ``values``: for each factor, its variables as in the class docstring. The
-        camera's constants must be equal for all. Returns residuals (N, 2) and the Jacobian (N, 2, d) by each variable
-        of size d."""
+        """Linearise N factors of one camera. ``values``: the variables of each factor (pose, estimated constants, roll
+        and pitch, point). The camera's constants must be equal in all. Returns residuals (N, 2) and the Jacobian (N, 2,
+        d) by each variable."""
         estimated, constants = factors[0].estimated, values[0][1]
         residual, jacobian, _ = _linearize_all(factors, values)
         if TIME_OFFSET in estimated:
@@ -67,12 +67,13 @@ class PointFactor:
         return residual, blocks
 
     def cost(self, values: Sequence[Array]) -> float:
-        """Return the robust loss of the pixel. ``values``: the variables, as in the class docstring."""
+        """Return the robust loss of the pixel. ``values``: pose, constants, roll and pitch, and point, see the
+        class."""
         return float(huber_loss(_linearize_all([self], [values])[2], self.model.robust).sum())
 
     def is_astray(self, values: Sequence[Array]) -> bool:
         """True if the pixel is certainly a false match: the point is behind the camera, or its predicted pixel is at
-        least :data:`BEHIND` standard deviations from the measured one."""
+        least :data:`BEHIND` standard deviations from the measured one. ``values``: the variables, see the class."""
         return bool(_linearize_all([self], [values])[2][0] >= BEHIND**2)
 
 

@@ -75,7 +75,7 @@ class BearingRangeFactor:
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Return the whitened residual (2K,) with robust weights, and a list of its Jacobians (2K, d), one for each
-        variable. ``values``: the variables, as in the class docstring."""
+        variable. ``values``: the pose (3,), then the estimated constants, bias and position, see the class."""
         if not (self.free or self.biased):
             constants = values[1] if self.estimated else NOTHING
             linear = kernels.weighted(self.model.packed, self.packed, values[0], constants, self.places)
@@ -123,7 +123,8 @@ class BearingRangeFactor:
         return _places(self.estimated)
 
     def cost(self, values: Sequence[Array]) -> float:
-        """Return the robust loss, summed over the landmarks. ``values``: the variables, as in the class docstring."""
+        """Return the robust loss, summed over the landmarks. ``values``: pose, constants, bias, position, see the
+        class."""
         error, _, slopes = self._linearized(values)
         return float(losses.loss(self.model.packed, error, slopes))
 
@@ -165,7 +166,8 @@ class BearingRangeFactor:
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Return the whitened residual (K, 2), predicted minus measured, and a list of its Jacobians (K, 2, d), one for
-        each variable. ``values``: the variables, as in the class docstring. Robust weights are not included."""
+        each variable, without robust weights. ``values``: the pose (3,), then the estimated constants, bias and
+        position."""
         return self._linearized(values)[:2]
 
     def _linearized(self, values: Sequence[Array]) -> tuple[Array, list[Array], Array]:
@@ -237,8 +239,8 @@ class BearingRangeFactor:
     def locate(self, values: Sequence[Array]) -> tuple[Array, list[Array], Array]:
         """Compute the position of a single landmark from its range and bearing, to initialise a free landmark.
 
-        ``values``: the values of the factor without the landmark's position. Returns the position (2,) in the world,
-        its Jacobian (2, d) by each of ``values``, and its covariance (2, 2) caused by the measurement noise.
+        ``values``: the pose (3,), then the estimated constants and the bias, see the class. Returns the position (2,)
+        in the world, its Jacobian (2, d) by each of ``values``, and its covariance (2, 2) due to measurement noise.
         """
         on_pose = self.fixed(values[1:], None)
         at = values[0] if on_pose.offset is None else se2.compose(values[0], on_pose.offset)

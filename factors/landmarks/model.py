@@ -180,7 +180,7 @@ def whitened_into(
 ) -> None:
     """Compute the whitened residuals of :func:`residuals` at one pose, with their Jacobian.
 
-    ``pose`` (3,): the robot's pose.
+    ``pose`` (3,): the robot's pose. ``mounting``, ``depth``, ``depth_axis``: as in :class:`BearingRangeModel`.
     ``model``: range scale, range sigma, relative range sigma, bearing bias, bearing sigma.
     ``error`` (K, 2): output, the residuals. Must contain zeros before the call.
     ``jacobian`` (K, 2, WIDTH): output, the derivatives by the body-frame perturbation of the pose, by the point, and by

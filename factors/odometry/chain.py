@@ -51,7 +51,7 @@ TWIST_TIME = 0.1  # s; a velocity is the mean over this time
 
 
 class OdometryChain:
-    """The integrated odometry of a run. Add rows (odometry measurements), then ask for states and motions at any time.
+    """The integrated odometry of a run. Add odometry measurements (rows), then ask for states and motions at any time.
 
     Rows may arrive late. The integrated states at the later rows are then computed again. After the last row, the robot
     is assumed to continue with its velocity.
@@ -90,15 +90,15 @@ class OdometryChain:
         self._noise = np.array(m.noise())
 
     def add_velocity(self, t: float, v: float, w: float) -> bool:
-        """Add a row with forward velocity [m/s] and turn rate [rad/s], valid from ``t`` until the next row. Returns
-        False if the row is too old and is ignored."""
+        """Add an odometry measurement of forward speed [m/s] and turn rate [rad/s], valid from ``t`` until the next
+        measurement. Returns False if it is too old and is ignored."""
         return self._insert(t + self.model.delay, VELOCITY, v, w, 0.0, 0.0)
 
     def add_increment(self, t: float, dx: float, dy: float, dtheta: float, unknown: float = 0.0) -> bool:
-        """Add the motion (dx, dy, dtheta) from the previous row until ``t``, in the robot frame at the previous row.
+        """Add the motion (dx, dy, dtheta) from the previous measurement until ``t``, in the robot frame at its start.
 
-        ``unknown`` [s]: the time of unknown motion since the previous row. A motion with the same ``t`` as an existing
-        row is composed with that row. Returns False if the row is too old and is ignored.
+        ``unknown`` [s]: the time of unknown motion since the previous measurement. A motion with the same ``t`` as an
+        existing one is composed with it. Returns False if it is too old and is ignored.
         """
         move, last = np.array((dx, dy, dtheta), dtype=float), self._count - 1
         while last >= 0 and self._rows[last, 0] == t and self._rows[last, 1] != INCREMENT:
@@ -112,13 +112,13 @@ class OdometryChain:
         return self._insert(t, INCREMENT, x, y, turned, unknown)
 
     def add_yaw_rate(self, t: float, w: float) -> bool:
-        """Add a gyro row with turn rate ``w`` [rad/s], valid from ``t`` until the next gyro row. It replaces the
-        rotation of the wheels. Returns False if the row is too old and is ignored."""
+        """Add a gyro measurement of the turn rate ``w`` [rad/s], valid from ``t`` until the next gyro measurement. It
+        replaces the rotation of the wheels. Returns False if it is too old and is ignored."""
         return self._insert(t, GYRO, w, 0.0, 0.0, 0.0)
 
     def add_velocities(self, t: Array, v: Array, w: Array) -> int:
-        """Add N rows (N,) as :meth:`add_velocity` does, in order of time. Returns the number of rows that were
-        added."""
+        """Add N velocities (N,) as :meth:`add_velocity` does, in order of time. Returns the number that were not too
+        old."""
         if not len(t):
             return 0
         self._reserve(len(t))
@@ -130,8 +130,8 @@ class OdometryChain:
         return len(t)
 
     def add_increments(self, t: Array, dx: Array, dy: Array, dtheta: Array, unknown: Array | None = None) -> None:
-        """Add N motions (N,) as :meth:`add_increment` does, in order of time and after all existing rows. Motions with
-        equal times are composed."""
+        """Add N motions (N,) as :meth:`add_increment` does, in order of time and after all existing measurements.
+        Motions with equal times are composed."""
         last, moves = composed(t, np.column_stack((dx, dy, dtheta)))
         if not len(last):
             return
@@ -145,8 +145,8 @@ class OdometryChain:
         self._now_has(count, forgets=count < end)
 
     def state(self, t: float) -> ChainState:
-        """Return the integrated state at time ``t`` [s]. Before the first row the pose is constant and the motion
-        counts as unknown. Raises ValueError if the rows of that time are deleted."""
+        """Return the integrated state at time ``t`` [s]. Before the first measurement the pose is constant and the
+        motion counts as unknown. Raises ValueError if the odometry of that time is deleted."""
         if t < self.begin:
             raise ValueError(f"the odometry at {t:.3f} s was deleted, and is available only from {self.begin:.3f} s on")
         return ChainState(*state_at(self._knots, self._count, t, self._constants))
@@ -160,7 +160,8 @@ class OdometryChain:
     def begin_slip(self, since: float) -> None:
         """Report that the wheels slip since ``since`` [s]. The motion is unknown from then until :meth:`end_slip`.
 
-        Limitation: a row that is added later and is older than the newest row changes the time of unknown motion.
+        Limitation: a measurement that is added later and is older than the newest one changes the time of unknown
+        motion.
         """
         if not self._constants[SLIPPING] and self._count:
             self._knots[self._count - 1, UNKNOWN] += max(0.0, self._knots[self._count - 1, T] - since)
@@ -177,7 +178,7 @@ class OdometryChain:
 
     def relative(self, start: ChainState, end: ChainState) -> Increment:
         """Return the motion from ``start`` to ``end``, two results of :meth:`state`. Limitation: the motion is wrong if
-        a row older than ``start`` was added between the two calls of :meth:`state`."""
+        a measurement older than ``start`` was added between the two calls of :meth:`state`."""
         return Increment(*relative(self._noise, tuple(start), tuple(end)))
 
     def travelled(self, start: ChainState, t: float) -> tuple[ChainState, Increment]:
@@ -189,7 +190,7 @@ class OdometryChain:
 
     def twist(self, t: float) -> Array:
         """Return the robot's mean velocity (3,) in the last :data:`TWIST_TIME` seconds before ``t``, in the robot frame
-        [m/s, m/s, rad/s]. Raises ValueError if the rows of that time are deleted."""
+        [m/s, m/s, rad/s]. Raises ValueError if the odometry of that time is deleted."""
         if t - TWIST_TIME < self.begin:
             needed = f"the velocity at {t:.3f} s needs odometry from {t - TWIST_TIME:.3f} s on"
             raise ValueError(f"{needed}, but the odometry before {self.begin:.3f} s was deleted")

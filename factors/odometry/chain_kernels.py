@@ -37,8 +37,8 @@ def copy(row: Array, to: Array) -> None:
 
 @compiled
 def without_old(rows: Array, knots: Array, count: int, horizon: float) -> int:
-    """Delete the rows that are more than ``horizon`` seconds older than the newest row, and the states ``knots`` at
-    these rows. ``count``: the number of rows. Returns the new number.
+    """Delete the odometry measurements (``rows``) that are more than ``horizon`` seconds older than the newest, and the
+    integrated states ``knots`` at their times. ``count``: the number of rows. Returns the new number.
 
     Nothing is deleted before the oldest row is two horizons old, so that deletions are rare.
     """
@@ -211,8 +211,8 @@ def _turn_by_gyro(rows: Array, knots: Array, i: int, constants: Array) -> None:
 def move(knot: Array, duration: float, lag: float, hold: float, slipping: float, out: Array) -> None:
     """Predict the integrated state ``knot`` by ``duration`` seconds, and write the new state into ``out``.
 
-    The velocity converges to its target with the time constant ``lag`` [s], and continues for at most ``hold`` seconds.
-    The motion after that is unknown. If ``slipping`` is 1, all motion is unknown.
+    The velocity converges to the commanded velocity with the time constant ``lag`` [s], and continues for at most
+    ``hold`` seconds. The motion after that is unknown. If ``slipping`` is 1, all motion is unknown.
     """
     ux, uy, uw = knot[_UX], knot[_UY], knot[_UW]
     moving = min(duration, hold)

@@ -93,7 +93,7 @@ class OdometryFactor:
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Return the whitened residual (3,) ``log(delta^-1 * start^-1 * end)``, and a list of its Jacobians by each
-        variable. ``values``: the variables, as in the class docstring."""
+        variable. ``values``: the start pose (3,), the end pose (3,) and, if estimated, the constants (P,)."""
         start, end, *constants = values
         if constants:
             changed = self._arc, self._moving, constants[0], self._indices

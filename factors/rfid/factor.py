@@ -140,7 +140,7 @@ class RfidFactor:
         return residual, [jacobian[:, :3], jacobian[:, 3:]] if self.estimated else [jacobian]
 
     def cost(self, values: Sequence[Array]) -> float:
-        """Return the tempered negative log-likelihood. ``values``: the variables, as in the class docstring."""
+        """Return the tempered negative log-likelihood. ``values``: the pose (3,) and, if P > 0, the parameters (P,)."""
         return float((self.fixed(values[1]) if self.estimated else self).score(values[:1]).nll[0])
 
     def correct(

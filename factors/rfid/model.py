@@ -245,7 +245,7 @@ def bake(
     model: DetectionModel, extent: float, cell: float = 0.1, heights: Sequence[float] = (0.0,), facings: int = 1
 ) -> GridModel:
     """Convert any detection model to a grid from -``extent`` to ``extent`` [m] in x and y. ``cell`` [m]: the spacing.
-    ``heights`` [m]: tag heights above the antenna. ``facings``: the number of evenly spaced cosines of the facing."""
+    ``heights`` [m]: tag heights above the antenna. ``facings``: the number of directions of the tag's front."""
     count = 2 * math.ceil(extent / cell) + 1
     axis = cell * (np.arange(count) - (count - 1) / 2.0)
     cosines = np.linspace(-1.0, 1.0, facings) if facings > 1 else np.zeros(1)

@@ -16,8 +16,8 @@ ANYWHERE = 1e9  # m; a distance that contains all tags, because tags on the robo
 
 @compiled(inline="always")
 def placed(packed: Packed, antenna: int, pose: Array, offset: Array) -> tuple[float, float, float, float]:
-    """Return x, y, and the cosine and sine of the heading of an antenna in the frame of the tags. The robot is at
-    ``offset`` (3,) in the frame of ``pose`` (3,)."""
+    """Return x, y, and the cosine and sine of the heading of an antenna in the frame of the tags: the world, or the
+    robot if the tags are on it. The robot is at ``offset`` (3,) in the frame of ``pose`` (3,)."""
     c0, s0 = math.cos(pose[2]), math.sin(pose[2])
     x, y = pose[0] + c0 * offset[0] - s0 * offset[1], pose[1] + s0 * offset[0] + c0 * offset[1]
     c, s = math.cos(pose[2] + offset[2]), math.sin(pose[2] + offset[2])
@@ -46,8 +46,10 @@ def reach_of(packed: Packed, offsets: Array) -> float:
 
 @compiled(inline="always")
 def place_measurements(packed: Packed, pose: Array, offsets: Array, antennas: Integers, out: Array) -> float:
-    """Write the antenna of each measurement into ``out`` (K, 8): position and boresight in the frame of the tags, then
-    boresight and position in the frame of ``pose``. Returns the largest distance [m] at which a tag can be read."""
+    """Write the antenna of each of K measurements into ``out`` (K, 8): position and boresight in the frame of the tags
+    (the world, or the robot if the tags are on it), then boresight and position in the frame of ``pose`` (3,).
+    ``offsets`` (K, 3): the robot in the frame of ``pose``. Returns the largest distance [m] at which a tag can be
+    read."""
     farthest = 0.0
     for k in range(len(antennas)):
         a = packed.antennas[antennas[k]]

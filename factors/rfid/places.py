@@ -53,8 +53,8 @@ class RobotTables(NamedTuple):
 
 
 class MissTable(NamedTuple):
-    """The log-likelihood that all antennas of a scan miss a tag, by the tag's position in the robot frame. It is
-    relative to the log-likelihood that they miss a tag out of reach.
+    """The log-likelihood that no antenna reads a tag in a scan (K measurements), by the tag's position in the robot
+    frame. It is relative to the log-likelihood of a tag out of reach.
 
     ``surveyed`` (H, S, S): untempered values of a tag at one of H heights that is as in the map.
     ``folded`` (H, S, S): tempered values of a tag that may be weak, moved or dead.
@@ -102,7 +102,7 @@ def antennas_of(packed: Packed, tables: Tables) -> Antennas:
 
 
 def is_wide(poses: Array, reach: float) -> bool:
-    """True if most tags are within ``reach`` [m] of only a few of the poses (N, 3), because the poses are far apart."""
+    """True if the poses (N, 3) are so far apart that most tags are within ``reach`` [m] of only a few of them."""
     reached = np.ptp(poses[:, :2], axis=0) + 2.0 * reach
     return bool(np.prod(reached) > WIDE * (2.0 * reach) ** 2)
 

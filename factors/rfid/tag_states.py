@@ -64,9 +64,9 @@ def displacements() -> Array:
 
 
 def hypotheses() -> Array:
-    """Return the S states (S, 4) of a tag that is not dead: as in the map, weak in several degrees, or moved by each of
-    several displacements. A row has the displacement (2) [m], and the changes of the parameters a and b of
-    :mod:`factors.rfid.parameters`."""
+    """Return the S possible states (S, 4) of a tag that is not dead: as in the map, weak in several degrees, or moved
+    by each of several displacements. A row has the displacement (2) [m], the change of the logarithm of the range, and
+    the change of the logit of the read rate."""
     weak, moves = WEAKNESSES[:, :2], displacements()
     still, usual = np.zeros_like(weak), np.zeros_like(moves)
     return np.concatenate((np.zeros((1, 4)), np.hstack((still, weak)), np.hstack((moves, usual))))
@@ -78,11 +78,12 @@ def _log(probability: float) -> float:
 
 
 class TagStates:
-    """Bayesian filters that estimate whether each of T tags is as in the map, dead, weak or moved.
+    """Bayesian filters that estimate whether each of T tags is as in the map, dead (never read), weak (read less often
+    or at a shorter range) or moved. ``count``: T. ``dead``, ``weak``, ``moved``: the prior probabilities, below 1 in
+    sum.
 
-    ``count``: T. ``dead``, ``weak``, ``moved``: the prior probabilities of these states, below 1 in sum. Attributes:
-    ``odds`` (T,) are the log-odds that each tag is dead, weak or moved. ``prior`` is the prior value of the log-odds.
-    ``hypotheses`` (S, 4) is the result of :func:`hypotheses`. ``last_read`` [s] is the time of the last read.
+    Attributes: ``odds`` (T,) are the log-odds that each tag is dead, weak or moved. ``prior`` is the prior value of the
+    log-odds. ``hypotheses`` (S, 4) is the result of :func:`hypotheses`. ``last_read`` [s] is the time of the last read.
     """
 
     def __init__(self, count: int, dead: float, weak: float, moved: float) -> None:
