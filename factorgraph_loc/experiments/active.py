@@ -44,7 +44,10 @@ PLOTS, PICTURE = "plots", "run.png"
 
 @dataclass(frozen=True)
 class ActiveJob:
-    """A planned run of active localization in the simulated world ``simulation``. ``pictured``: whether it is plotted."""
+    """A planned simulation of active localization: the robot chooses its path with ``policy`` to localize itself.
+
+    ``simulation``: the simulated world. ``settings``: settings of robot and policy. ``pictured``: whether to plot it.
+    """
 
     simulation: SimulationSettings
     policy: str
@@ -60,13 +63,13 @@ class ActiveJob:
 
     @property
     def key(self) -> str:
-        """The key of the stored results: a hash of the settings and the version of the package."""
+        """The key of the stored results: a hash of all fields and of the version of the package."""
         given: list[Any] = [__version__, self.policy, self.estimator, self.seed, self.pictured]
         return digest_of(given + [model.model_dump(mode="json") for model in (self.simulation, self.settings)])
 
     def make(self) -> Files:
-        """Execute the run. Return its files as {file name: content}: the scores as JSON and the plot as PNG. If the run
-        rejects its input, the only file describes the failure."""
+        """Execute the run. Return {file name: content}: the scores as JSON, and the plot as PNG if ``pictured`` is set.
+        If the run rejects its input, the only file describes the failure."""
         try:
             run = run_active(self.simulation, self.policy, self.estimator, self.seed, self.settings)
         except InputError as error:
@@ -81,7 +84,7 @@ class ActiveJob:
 
     @property
     def columns(self) -> dict[str, Any]:
-        """The first columns of the run's row in the table of results."""
+        """World, policy, estimator, seed and key of the run: the first columns of its row in the table of results."""
         named = {"world": self.source, "policy": self.policy, "estimator": self.estimator, "seed": self.seed}
         return named | {"key": self.key}
 
@@ -98,12 +101,14 @@ def active(
     overwrite: bool = False,
     progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> Done:
-    """Simulate robots that drive from an unknown start until they are localized, for each policy, estimator and seed.
+    """Simulate robots that drive from an unknown start until they are localized, and compare policies that choose
+    paths.
 
-    ``world``: a preset of :func:`~factorgraph_loc.api.logs.simulate`, a TOML file, or settings. ``out``: folder for the
-    results. ``overwrite``: whether existing results in ``out`` may be replaced. ``changes``: nested settings of robot,
-    policy or world, such as ``{"policy": {"horizon": 8}}``. ``jobs``: number of processes, None for one per core.
-    ``progress``: called with the number of finished runs and of all runs.
+    There is a run for each policy, estimator and seed. ``world``: a preset of
+    :func:`~factorgraph_loc.api.logs.simulate`, a TOML file, or settings. ``out``: folder for the results.
+    ``overwrite``: whether existing results in ``out`` may be replaced. ``changes``: nested settings of robot, policy or
+    world, such as ``{"policy": {"horizon": 8}}``. ``jobs``: number of processes, None for one per core. ``progress``:
+    called with the number of finished runs and of all runs.
 
     The files in ``out`` are ``results.parquet`` and ``results.csv`` (a row for each run), ``differences.csv`` (see
     :func:`~factorgraph_loc.experiments.active_results.differences`), ``table.md``, ``config.toml`` and
@@ -149,7 +154,7 @@ def active(
 
 
 def _write(table: pl.DataFrame, jobs: Sequence[ActiveJob], out: Path) -> None:
-    """Write the tables and plots of all runs."""
+    """Write the tables and plots of all runs into ``out``. ``table``: the results, with a row for each of ``jobs``."""
     rows = table.to_dicts()
     text = markdown(*summary_cells(rows)) + "\n" + markdown(*difference_cells(rows))
     output.write_tables(table, pl.DataFrame(differences(rows), schema=DIFFERENCES), text, out)
@@ -163,7 +168,8 @@ def _write(table: pl.DataFrame, jobs: Sequence[ActiveJob], out: Path) -> None:
 def _settings(
     world: str | Path | SimulationSettings, changes: Mapping[str, Any]
 ) -> tuple[SimulationSettings, ActiveSettings]:
-    """Return the settings of the simulated world and of the run, with ``changes``. Raises InputError for an unknown key."""
+    """Return the settings of the simulated world and of the run. ``changes``: values that replace settings, by key.
+    Raises InputError for an unknown key."""
     of_run, of_world = ActiveSettings.model_fields, SimulationSettings.model_fields
     for key in changes:
         if key not in of_run and key not in of_world:
@@ -179,7 +185,7 @@ def _settings(
 
 
 def figures_of(run: ActiveRun) -> dict[str, float | None]:
-    """Return the scores of a run by column of the table of results, such as ``metres`` and ``planning_ms``."""
+    """Return the scores of a run as {column of the table of results: value}, such as ``metres`` and ``planning_ms``."""
     times = run.planning_ms
     return {
         "localized": run.localized,
@@ -195,7 +201,7 @@ def figures_of(run: ActiveRun) -> dict[str, float | None]:
 
 
 def _check_names(what: str, names: Sequence[str], known: Sequence[str]) -> None:
-    """Raise InputError if there are no names, or if one is repeated or not in ``known``. ``what``: the kind of names."""
+    """Raise InputError if ``names`` is empty, or a name is repeated or not in ``known``. ``what``: such as "policy"."""
     if not names:
         raise InputError(f"no {what} is given; known: {', '.join(known)}")
     for name in names:

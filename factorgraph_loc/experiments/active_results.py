@@ -41,27 +41,27 @@ ARROW = 0.7  # m; length of the line that shows the robot's heading
 
 
 def cases(rows: Sequence[Row]) -> list[Case]:
-    """Return the different pairs (world, estimator) of the runs, in the order of their first runs."""
+    """Return the distinct pairs (world, estimator) in the rows of a table of runs, in the order of the rows."""
     return list(dict.fromkeys((row["world"], row["estimator"]) for row in rows))
 
 
 def policies(rows: Sequence[Row]) -> list[str]:
-    """Return the different policies of the runs, in the order of their first runs."""
+    """Return the names of the distinct policies in the rows of a table of runs, in the order of the rows."""
     return list(dict.fromkeys(row["policy"] for row in rows))
 
 
 def runs_of(rows: Sequence[Row], case: Case, policy: str) -> list[Row]:
-    """Return the runs of one world and estimator (``case``) with one policy."""
+    """Return the rows of the runs with one ``case`` (world, estimator) and one policy."""
     return [row for row in rows if (row["world"], row["estimator"]) == case and row["policy"] == policy]
 
 
 def metres(rows: Sequence[Row]) -> Array:
-    """Return the distances (N,) [m] that robots drove until they were localized, infinite if they never were."""
+    """Return the distances (N,) [m] that the robots drove in N runs until they were localized, infinite if never."""
     return np.array([row["metres"] if row.get("localized") else math.inf for row in rows], dtype=float)
 
 
 def summaries(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Return statistics for each world, estimator and policy, as dictionaries with these keys.
+    """Return statistics of the runs for each world, estimator and policy, as dictionaries with these further keys.
 
     - ``runs``: number of runs.
     - ``median``, ``p90``: median and 90th percentile of the distance [m] until the robot is localized.
@@ -103,11 +103,13 @@ def summaries(rows: Sequence[Row]) -> list[dict[str, Any]]:
 def differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """Return comparisons of the first policy ``a`` with each other policy ``b``, for each world and estimator.
 
+    ``rows``: the runs. Only seeds of both policies are used; ``pairs`` is their number. Distance means the distance [m]
+    until the robot is localized. The other keys of a comparison are:
+
     - ``difference``, ``low``, ``high`` [m]: median distance of a minus that of b, and its 95 % interval.
     - ``ratio``, ``ratio_low``, ``ratio_high``: median distance of a divided by that of b, and its 95 % interval.
     - ``failed_only_a``, ``failed_only_b``: number of seeds with a failure of a only, and of b only.
-    - ``p``: p value of McNemar's exact test for equal failure rates. ``pairs``: number of the common seeds, which are
-      used.
+    - ``p``: p value of McNemar's exact test for equal failure rates.
     """
     results = []
     first, *further = policies(rows)
@@ -179,7 +181,7 @@ def metres_text(value: float) -> str:
 
 
 def _interval_text(interval: Sequence[float], digits: int) -> str:
-    """Return a value and its interval as text. ``interval``: the value, the lower and the upper bound, which may be infinite."""
+    """Return an interval as text. ``interval``: the value, the lower and the upper bound, which may be infinite."""
     value, low, high = (
         f"{bound:.{digits}f}".replace("inf", "∞") if math.isinf(bound) else number(bound, digits) for bound in interval
     )
@@ -193,8 +195,8 @@ def _median(rows: Sequence[Row], key: str) -> float:
 
 
 def comparison(rows: Sequence[Row]) -> Figure:
-    """Plot the distance until localization for each world and estimator: a box for each policy, and the fraction of
-    localized runs over distance."""
+    """Return a figure of the distances until localization, with a box for each policy. It also shows the fraction of
+    localized runs over distance. There is a row for each world and estimator."""
     panels = cases(rows)
     seeds = len({row["seed"] for row in rows})
     figure, axes = grid(len(panels), 2, 4.2 * len(panels) + 1.0, f"metres driven until localized, {seeds} runs of each")
@@ -208,8 +210,8 @@ def comparison(rows: Sequence[Row]) -> Figure:
 
 
 def run_picture(run: ActiveRun) -> Figure:
-    """Plot some decisions of a run: the belief, the candidate paths and the chosen path. Also plot the belief's
-    standard deviation over distance."""
+    """Return a figure of some decisions of a run: the estimated distribution of the pose (belief), the candidate paths
+    and the chosen path. It also shows the standard deviation of the belief over distance."""
     chosen = np.unique(np.linspace(0, len(run.steps) - 1, SHOWN).round().astype(int)) if run.steps else ()
     rows = max(math.ceil(len(chosen) / COLUMNS), 1)
     width, depth = np.ptp(_outline(run).reshape(-1, 2), axis=0)
@@ -235,9 +237,9 @@ def run_picture(run: ActiveRun) -> Figure:
 
 
 def _boxes(axis: Axes, rows: Sequence[Row], case: tuple[str, str]) -> None:
-    """Plot the distances until localization of the runs of ``case`` (world, estimator): a box for each policy, a dot for each run.
+    """Plot the distances until localization of the runs of ``case`` (world, estimator), with a box for each policy.
 
-    Runs that never localized the robot are drawn at the largest distance, with their number.
+    A dot is a run. Runs that never localized the robot are drawn at the largest distance, with their number.
     """
     names = policies(rows)
     top = _farthest(rows, case)
@@ -261,7 +263,7 @@ def _boxes(axis: Axes, rows: Sequence[Row], case: tuple[str, str]) -> None:
 
 
 def _shares(axis: Axes, rows: Sequence[Row], case: tuple[str, str]) -> None:
-    """Plot the fraction of localized runs of ``case`` (world, estimator) over the driven distance, with a line for each policy."""
+    """Plot the fraction of localized runs of ``case`` (world, estimator) over the driven distance, by policy."""
     longest = _farthest(rows, case)
     for policy, style in zip(policies(rows), styles(), strict=False):
         driven = np.sort(metres(runs_of(rows, case, policy)))

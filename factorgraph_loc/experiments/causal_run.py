@@ -39,7 +39,7 @@ GARBAGE_THRESHOLDS = 20_000, 20, 20  # see the documentation of ``gc.set_thresho
 
 @dataclass
 class CausalEstimates:
-    """The estimates of a run, which are recorded at regular times (ticks). Each field is a list with one entry per tick.
+    """The estimates of a run, recorded online at regular times (ticks). Each field is a list with one entry per tick.
 
     ``t``: times [s]. ``poses``, ``covariances``: (3,) and (3, 3), of (x, y, heading) [m, rad]. ``status``: whether the
     pose is known, ambiguous or unknown. ``doubts_model``: whether measurements contradict the model of their sensor.
@@ -62,12 +62,12 @@ class CausalEstimates:
 
 @dataclass
 class CausalRun:
-    """The main loop of one run of an estimator on a log.
+    """The main loop of one run of an estimator on a log. Estimates are recorded at regular times (``ticks``).
 
-    ``guard``: converts exceptions of the estimator to RunFailedError. ``sensors``: names of the used sensors. ``prior``: prior of
-    the start, None if it is unknown. ``ticks``: times at which estimates are recorded. ``frame``: converts estimates from the frame
-    of the map to the world frame. ``progress``: called with the fraction done. ``watch``: called with the time and the estimator
-    after each tick. ``end`` [s]: later measurements are not processed. ``estimates``: the recorded estimates.
+    ``guard``: converts exceptions of the estimator to RunFailedError. ``sensors``: names of the used sensors.
+    ``prior``: prior of the start pose, None if it is unknown. ``frame``: converts estimates from the frame of the map
+    to the world frame. ``progress``: called with the completed fraction. ``watch``: called with the time [s] and the
+    estimator after each tick. ``end`` [s]: later measurements are not processed. ``estimates``: the recorded estimates.
     """
 
     guard: Guard
@@ -95,7 +95,7 @@ class CausalRun:
         self._update_s: list[float] = []
 
     def run(self) -> None:
-        """Process all measurements and ticks, and measure the times of updates."""
+        """Process all measurements, record the estimates at all ticks, and measure the computing times."""
         started = perf_counter()
         for (t, is_motion), group in groupby(self._measurements(), attrgetter("t", "is_motion")):
             if is_motion:
@@ -116,9 +116,9 @@ class CausalRun:
         self.progress(1.0)
 
     def timings(self, final_seconds: float, prepared: PreparedLog) -> Timings:
-        """Return the computing times of a run, after :meth:`run`.
+        """Return the computing times of a run. Call this after :meth:`run`.
 
-        ``final_seconds``: time for the final trajectory. ``prepared``: has the time for the extraction of image features.
+        ``final_seconds`` [s]: time for the final trajectory. ``prepared``: has the time for the detection of features.
         """
         return Timings(
             update_t=np.array(self._update_t),
@@ -132,22 +132,22 @@ class CausalRun:
         )
 
     def _measurements(self) -> Iterator[Measurement]:
-        """Return the measurements until ``end``. Successive rows of odometry are joined in one ``Rows`` object, if the
-        estimator has the attribute ``takes_rows``."""
+        """Return the measurements until ``end``, in order of time. If the estimator has the attribute ``takes_rows``,
+        successive measurements of odometry are joined in one ``Rows`` object."""
         joined = getattr(self.estimator, "takes_rows", False)
         steps = self.log.steps(self.sensors) if joined else self.log.measurements(self.sensors)
         return takewhile(lambda m: m.t <= self.end, steps)
 
     def _reach(self, t: float) -> None:
-        """Record the estimates at all ticks before ``t`` [s], the time of the next measurement. Initialize the
-        estimator first if it is not initialized and ``t`` is later than the start."""
+        """Record the estimates at all ticks before ``t`` [s], the time of the next measurement. If ``t`` is later than
+        the start, first initialize the estimator, unless it is initialized already."""
         if not self._initialized and t > self._start:
             self._initialize()
         self._pass(self.ticks.advance(t))
 
     def _move(self, m: Measurement) -> None:
-        """Process a row of odometry, or several successive rows (``Rows``). Estimates at ticks between joined rows are recorded
-        after the rows, because the state at a time depends only on rows before that time."""
+        """Process one measurement of odometry, or several (``Rows``). Estimates at ticks between joined measurements
+        are recorded after them, because the state at a tick depends only on earlier measurements."""
         if not isinstance(m, Rows):
             self._reach(m.t)
             self.guard.process(self.estimator, m)
@@ -162,7 +162,7 @@ class CausalRun:
             first = last
 
     def _initialize(self) -> None:
-        """Initialize the estimator at the prior."""
+        """Initialize the estimator at the prior of the start pose."""
         assert self.prior is not None
         self._initialized = True
         with self.guard.computing("the start", self.prior.t):
@@ -199,7 +199,7 @@ class CausalRun:
 
 
 def span_of(log: Log, sensors: tuple[str, ...]) -> tuple[float, float]:
-    """Return the first and the last timestamp [s] of the measurements of ``sensors``. Raises InputError if there are none."""
+    """Return the first and the last timestamp [s] of the measurements of ``sensors``. Raises InputError without any."""
     streams = {s: log.streams[s].t for s in sensors if s in log.streams}
     stamps: list[Array] = [t + log.rig.time_offset(s) for s, t in streams.items() if len(t)]
     if not stamps:
@@ -209,7 +209,7 @@ def span_of(log: Log, sensors: tuple[str, ...]) -> tuple[float, float]:
 
 @contextmanager
 def rare_garbage_collection() -> Iterator[None]:
-    """Let Python collect garbage less often in this block, and only objects that are created in it."""
+    """Make Python collect garbage less often in this block, and only objects that are created in the block."""
     if gc.get_freeze_count():
         yield
         return

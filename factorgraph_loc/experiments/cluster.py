@@ -39,14 +39,14 @@ _ONE = Lock()  # a worker process executes one run at a time, so that computing 
 
 @dataclass(frozen=True)
 class _Made:
-    """The files of a run. ``late``: the address of the worker that still executes the run after the time limit, None if none."""
+    """The files of a run by name. ``late``: address of the worker if it still runs after the time limit, or None."""
 
     files: Files
     late: str | None = None
 
 
 class Cluster(Executor):
-    """Executes runs on the cluster of a scheduler. ``scheduler``: address of the scheduler.
+    """Executes runs on a ``dask.distributed`` cluster. ``scheduler``: address of its scheduler.
 
     This class limits the time of a run, and the cluster limits the memory. ``with`` raises InputError if the package
     ``distributed`` is not installed, or if the scheduler does not answer or has no workers. InputError is also raised
@@ -125,7 +125,7 @@ class Cluster(Executor):
 
 
 def make(run: Planned, version: str, seconds: float) -> _Made:
-    """Execute a run on a worker, in at most ``seconds``.
+    """Execute a run on a worker, in at most ``seconds``. Return the files of the run, or of its failure.
 
     ``version``: digest of the code and libraries of the experiment. Raises InputError if the worker has another digest.
     """
@@ -156,7 +156,7 @@ def make(run: Planned, version: str, seconds: float) -> _Made:
 
 
 def _findable(run: Planned) -> Planned:
-    """Return the run with the absolute path of the data folder, so that it does not depend on the worker's environment."""
+    """Return the run with an absolute data folder, so that it does not depend on the environment of a worker."""
     if not isinstance(run, PlannedRun) or not isinstance(run.source, RecordedSource):
         return run
     root = run.source.data_root or os.environ.get(DATA_ROOT)

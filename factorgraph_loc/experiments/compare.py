@@ -38,7 +38,7 @@ FINISHED = (*WRITTEN, *FILES)  # names of files of results, which are replaced o
 
 @dataclass(frozen=True, repr=False)
 class Comparison(Done):
-    """The results of a comparison. ``repr`` gives its table. ``out``: the folder of the results."""
+    """The results of a comparison of estimators. ``repr`` gives its table. ``out``: the folder of the results."""
 
     out: Path
 
@@ -47,7 +47,8 @@ class Comparison(Done):
 
 
 def summary_text(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return the table of a comparison as text, with sentences about missing scores, the best estimator and failed runs."""
+    """Return the table of a comparison as text, with sentences about missing scores, the best estimator and failed
+    runs. ``rows``: the runs."""
     best = verdict(rows) if len({row["estimator"] for row in rows}) > 1 else []
     failures = [f"failed: {row['log']}, {row['estimator']}: {row['reason']}" for row in rows if row["status"] != "ok"]
     return "\n".join((markdown(*comparison_cells(rows)), *unscored(rows), *best, *failures))
@@ -72,19 +73,21 @@ def compare(
     overwrite: bool = False,
     progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> Comparison:
-    """Run several estimators on several logs with each seed, and compare them.
+    """Run several estimators on several logs with each seed, and return a comparison of their errors.
 
-    ``out``: folder for the results, None for a new folder in ``out/``. ``overwrite``: whether existing results in ``out`` may
-    be replaced. ``settings``: by estimator, its settings by key. ``rig``, ``world``: replace those of all logs.
-    ``sensors``, ``prior``, ``max_gap``, ``tick_gap``, ``align``: see
-    :class:`~factorgraph_loc.experiments.experiment_file.Experiment`. ``rpe``: whether to write relative errors.
-    ``jobs``: number of processes, None for one per core. ``progress``: called with the numbers of finished and of all runs.
+    ``out``: folder for the results, None for a new folder in ``out/``. ``overwrite``: whether existing results in
+    ``out`` may be replaced. ``settings``: {estimator: {key: value}}. ``rig``, ``world``: sensors and map to use instead
+    of those of the logs. ``sensors``, ``prior``, ``max_gap``, ``tick_gap``, ``align``: see
+    :class:`~factorgraph_loc.experiments.experiment_file.Experiment`. ``rpe``: whether to report relative pose errors.
+    ``jobs``: number of processes, None for one per core. ``progress``: called with the numbers of finished and all
+    runs.
 
-    A failed run does not stop the others, and the table states the reason. Runs with stored results are not repeated. The
-    files in ``out`` are:
+    A failed run does not stop the others, and the table states the reason. Runs with stored results are not repeated.
+    The files in ``out`` are:
 
     - ``results.parquet``, ``results.csv``: a row for each run. ``table.md``: the table of the comparison.
-    - ``differences.csv``: see :func:`~factorgraph_loc.evaluation.inference.differences`. ``plots``: folder of PNG files.
+    - ``differences.csv``: see :func:`~factorgraph_loc.evaluation.inference.differences`. ``plots``: folder of PNG
+      files.
     - ``report.html``: see :func:`~factorgraph_loc.evaluation.report.write_report`.
     - ``store``: folder with the files of each run, see :class:`~factorgraph_loc.experiments.store.Store`.
 
@@ -112,7 +115,7 @@ def compare(
 
 
 def _named(estimators: Sequence[str], settings: Mapping[str, Mapping[str, Any]]) -> Mapping[str, Mapping[str, Any]]:
-    """Return the settings of each estimator by name. Raises InputError for settings of an estimator that is not compared."""
+    """Return the settings of each of ``estimators`` by name. Raises InputError for settings of another estimator."""
     if unknown := [name for name in settings if name not in estimators]:
         raise InputError(f"settings are given for {unknown[0]}, which is not run here, expected {listed(estimators)}")
     return {name: settings.get(name, {}) for name in estimators}
@@ -121,8 +124,8 @@ def _named(estimators: Sequence[str], settings: Mapping[str, Mapping[str, Any]])
 def _experiment(
     logs: Sequence[Log], estimators: Mapping[str, Mapping[str, Any]], keys: Mapping[str, Any], *, rpe: bool
 ) -> Experiment:
-    """Return the comparison as an experiment. ``keys``: values of further fields of :class:`Experiment`. ``rpe``:
-    whether to report relative errors."""
+    """Return the comparison as an experiment. ``estimators``: {name: settings}. ``keys``: values of further fields of
+    :class:`Experiment`. ``rpe``: whether to report relative errors."""
     tables = further_tables([{"scoring.align": keys["align"]}] if keys["align"] != "none" else [], rpe=rpe)
     further = [key for keys in tables.values() for key in keys]
     content: dict[str, Any] = {
@@ -137,7 +140,7 @@ def _experiment(
 
 
 def _prepared(experiment: Experiment, logs: Sequence[Log], out: Path) -> Prepared[PlannedRun]:
-    """Plan the runs of the experiment, and read the states of stored results in ``out``."""
+    """Return the planned runs of the experiment, with the states of their stored results in ``out``."""
     with temporary_folder(of_system("plan")) as folder:  # nothing is written into ``out`` if the input is wrong
         runs = plan(experiment, folder, folder, given=[GivenSource(log, digest_of_log(log)) for log in logs])
     Store(out).create()
@@ -145,7 +148,7 @@ def _prepared(experiment: Experiment, logs: Sequence[Log], out: Path) -> Prepare
 
 
 def digest_of_log(log: Log) -> str:
-    """Return the sha256 of the content of a log in memory, including size and modification time of the files that it names."""
+    """Return the sha256 of a log in memory. For the files that it names, size and modification time are included."""
     total = hashlib.sha256()
 
     def add(value: Any) -> None:
@@ -182,7 +185,8 @@ def _plot(logs: Sequence[Log], prepared: Prepared[PlannedRun], folder: Path) -> 
 
 
 def _table(rows: Sequence[Mapping[str, Any]], *, rpe: bool) -> str:
-    """Return the content of ``table.md``: the table of the comparison, and the tables of :func:`further_tables`."""
+    """Return the content of ``table.md``. It has the table of the comparison, and the tables of
+    :func:`further_tables`."""
     text = markdown(*comparison_cells(rows))
     for title, columns in further_tables(rows, rpe=rpe).items():
         text += f"\n{title}\n\n{markdown(*comparison_cells(rows, columns))}"

@@ -38,7 +38,7 @@ def partly_scored(log: Log, final: Trajectory, max_gap: float) -> tuple[Notice, 
 
 def map_error_warning(log: Log, frame: MapFrame, final: Trajectory) -> tuple[Notice, ...]:
     """Return a warning about the error of a map that was made without a reference. It states the median and the maximum
-    along the trajectory ``final``. ``frame``: has the covariance of this error at each pose."""
+    of the error along the trajectory ``final``. ``frame``: has the covariance of this error at each pose."""
     if frame.error is None or not len(final):
         return ()
     worst = np.linalg.eigvalsh(frame.error(final.poses)[:, :2, :2])[:, -1]
@@ -51,7 +51,7 @@ def map_error_warning(log: Log, frame: MapFrame, final: Trajectory) -> tuple[Not
 
 
 def with_pauses(log: Log, skipped: Sequence[tuple[float, float]], tick_gap: float) -> tuple[Notice, ...]:
-    """Return a warning about gaps between measurements that have no estimates.
+    """Return a warning about gaps between measurements, for which there are no estimates.
 
     ``skipped``: begin and end [s] of each gap. ``tick_gap`` [s]: the minimum length of such a gap.
     """
@@ -70,7 +70,8 @@ def never_localized(
 ) -> tuple[Notice, ...]:
     """Return a warning with a likely reason if the start is unknown and the robot was never localized.
 
-    ``sensors``: the used sensors. ``status``: of each causal estimate. ``final``: the final trajectory.
+    ``sensors``: the used sensors. ``status``: of each causal estimate, such as "localized". ``final``: see
+    :func:`partly_scored`.
     """
     kinds_of_status = set(status)
     if "localized" in kinds_of_status or (len(final) and status[-1] == "unlocalized"):  # the latter: a batch estimator

@@ -44,7 +44,7 @@ class Planned(Protocol):
 
     ``key``: key of its results in the store. ``source``: identifies the data that it loads. Runs with the same source
     are computed in the same process if possible. ``shown``: a description that distinguishes the run from others.
-    ``columns``: the first columns of its row in the table of results.
+    ``columns``: {name: value} of the first columns of its row in the table of results.
     """
 
     @property
@@ -64,22 +64,22 @@ class Take(Protocol):
     """A function that claims and returns the next run, or None if there is none now."""
 
     def __call__(self, loaded: Hashable = None, avoided: Sequence[Hashable] = ()) -> Planned | None:
-        """Return the next run. Prefer a run with the source ``loaded``, which is in memory. Avoid the sources
-        ``avoided``, which other workers use."""
+        """Return the next run, if possible with the source ``loaded``, which the worker has in memory. Otherwise, if
+        possible, its source is none of ``avoided``, which other workers use."""
 
 
 class Executor(AbstractContextManager[Any], Protocol):
-    """Computes runs by :func:`compute` in other processes. It is a context manager, and stops all computations on exit."""
+    """Computes runs by :func:`compute` in other processes. As a context manager, it stops all computations on exit."""
 
     def submit(self, take: Take, left: int) -> None:
-        """Start as many runs as possible. ``take``: returns the next run. ``left``: number of runs that are not stored yet."""
+        """Start as many runs as possible. ``take``: returns the next run. ``left``: number of runs without a result."""
 
     def finished(self) -> Iterable[tuple[str, Files]]:
-        """Return the keys and files of runs that have ended since the last call. Waits at most about half a second."""
+        """Return (key, files) of each run that has ended since the last call. Waits at most about half a second."""
 
 
 class _Queue:
-    """The runs to compute. ``later``: runs that another process has claimed, each with the time to try again to claim it."""
+    """The runs to compute. ``later``: (time of the next attempt, run) for runs that another process has claimed."""
 
     def __init__(self, runs: Sequence[Planned]) -> None:
         self._runs: dict[Hashable, list[Planned]] = {}
@@ -111,12 +111,11 @@ class _Queue:
 def execute(
     runs: Sequence[Planned], folder: Path, executor: Executor, *, again: bool = False
 ) -> Iterator[tuple[str, State]]:
-    """Compute ``runs``, store their results or failures in the store below ``folder``, and yield the key and the state of each.
+    """Compute ``runs`` and store their results or failures below ``folder``. Yield the key and the state of each run.
 
-    Runs with stored results are not repeated. ``again``: repeat stored failures. If another process has claimed a run, this waits
-    for its result. When the generator is closed, the executor stops immediately, and unfinished runs are not stored.
-
-    Raises StoreError if the store cannot be written.
+    Runs with stored results are not repeated. ``again``: repeat stored failures. If another process computes a run,
+    this waits for its result. When the generator is closed, the executor stops immediately, and unfinished runs are not
+    stored. Raises StoreError if the store cannot be written.
     """
     store, queue = Store(folder), _Queue(runs)
     claims: dict[str, ExitStack] = {}
@@ -152,7 +151,7 @@ def execute(
 
 
 def compute(run: Planned) -> Files:
-    """Compute a run in this process. Return {file name: content}. A failure is returned as a file that describes it.
+    """Compute a run in this process. Return {file name: content}. After a failure, the only file describes the failure.
 
     Raises only StoreError, if the disk for temporary files is full or not writable.
     """
@@ -174,7 +173,7 @@ def compute(run: Planned) -> Files:
 
 
 def failure(kind: Kind, reason: str, details: str = "") -> Files:
-    """Return the file that describes a failed run, as {file name: JSON}. ``kind``: such as "timeout". ``reason``: a
+    """Return {file name: JSON} with the file that describes a failed run. ``kind``: such as "timeout". ``reason``: a
     sentence for the user. ``details``: a traceback, or ""."""
     content = {"kind": kind, "reason": reason} | ({"traceback": details} if details else {})
     return {FAILURE: json_text(content).encode()}
@@ -190,7 +189,7 @@ def _forget_peak_memory() -> None:
 
 @dataclass(eq=False)
 class _Worker(Worker):
-    """A worker process. ``source``: source of its last run, which is still in memory. ``since``: start of its run [s]."""
+    """A worker process. ``source``: source of its last run, which is in memory. ``since`` [s]: start of this run."""
 
     source: Hashable = None
     since: float = 0.0
@@ -249,7 +248,7 @@ class Processes(Executor):
                 yield run.key, failure(*failed)
 
     def _died(self, worker: _Worker) -> tuple[Kind, str] | None:
-        """Return the kind and the reason of the failure of the run of a dead ``worker``. Return None if the run is repeated."""
+        """Return the kind and the reason of a failure if a ``worker`` died in a run. None if the run is repeated."""
         if not worker.ready:
             self._stillborn += 1
             if self._stillborn >= ATTEMPTS:
@@ -263,7 +262,7 @@ class Processes(Executor):
         return "killed", f"its process died {ATTEMPTS} times without a message (killed, or a crash in native code)"
 
     def _exceeded_limit(self, worker: _Worker) -> tuple[Kind, str] | None:
-        """Return the kind and the reason of the failure of a run that exceeds a limit, or None if it does not."""
+        """Return the kind and the reason of a failure if a run exceeds its time or memory limit, else None."""
         if worker.job is None:
             return None
         if time.monotonic() - worker.since > self._time:

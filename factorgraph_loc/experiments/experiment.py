@@ -29,9 +29,9 @@ Run = TypeVar("Run", bound=Planned)
 
 @dataclass(frozen=True)
 class Prepared(Generic[Run]):
-    """The planned runs of an experiment. ``folder``: folder of the results. ``limits``: limits of each run.
+    """The planned runs of an experiment. ``folder``: folder of the results. ``limits``: time and memory of each run.
 
-    ``states``: by key of a run, the state of its stored results (ok, failed, missing, damaged).
+    ``states``: {key of a run: state of its stored results}, where the state is ok, failed, missing or damaged.
     """
 
     folder: Path
@@ -55,17 +55,16 @@ class Prepared(Generic[Run]):
         return [run for run in self.runs if self.states[run.key] == "damaged"]
 
     def todo(self, *, again: bool = False) -> list[Run]:
-        """Return the runs to execute, which have no usable results. ``again``: whether to include failed runs."""
+        """Return the runs without usable results, which are to be executed. ``again``: also return failed runs."""
         done = ("ok",) if again else ("ok", "failed")
         return [run for run in self.runs if self.states[run.key] not in done]
 
 
 @dataclass(frozen=True)
 class Done:
-    """The results of several runs.
+    """The results of several runs. ``warnings``: each distinct warning once. ``failures``: a text for each failed run.
 
-    ``table``: a row for each run, see :func:`~factorgraph_loc.experiments.result_table.load_results`. ``failures``: a
-    text for each failed run. ``warnings``: each warning once.
+    ``table``: a row for each run, see :func:`~factorgraph_loc.experiments.result_table.load_results`.
     """
 
     table: pl.DataFrame
@@ -74,16 +73,16 @@ class Done:
 
     @property
     def rows(self) -> list[dict[str, Any]]:
-        """The rows of the table, all with the same keys."""
+        """The rows of ``table`` as dictionaries, all with the same keys."""
         return self.table.to_dicts()
 
 
 @dataclass(frozen=True)
 class ExperimentStatus:
-    """The state of an experiment. ``folder``: folder of its results.
+    """The progress of an experiment. ``folder``: folder of its results.
 
-    ``labels``: by label of an estimator, the numbers of runs that are ok, failed, missing and damaged. ``failures``: a
-    row for each failed run, with its ``reason``. ``damaged``: descriptions of the runs with damaged results.
+    ``labels``: {label of an estimator: {state: number of runs}}, with the states ok, failed, missing and damaged.
+    ``failures``: a row for each failed run, with its ``reason``. ``damaged``: descriptions of damaged runs.
     """
 
     folder: Path
@@ -103,12 +102,12 @@ def experiment(
     retry_failed: bool = False,
     progress: Callable[[int, int, int], None] = lambda _done, _total, _failed: None,
 ) -> Done:
-    """Execute the runs of an experiment file that have no stored results yet.
+    """Execute the runs of an experiment file that have no stored results yet, and return the results of all runs.
 
     ``changes``, ``out``, ``data_root``: see :func:`prepare`. ``jobs``: number of processes, None for one per core.
     ``scheduler``: address of the scheduler of a ``dask.distributed`` cluster, which then executes the runs.
-    ``retry_failed``: whether to repeat failed runs. Damaged runs are always repeated.
-    ``progress``: called with the numbers of finished, all and failed runs.
+    ``retry_failed``: whether to repeat failed runs. Damaged runs are always repeated. ``progress``: called with the
+    numbers of finished, all and failed runs.
 
     A failed run raises no exception. It has a row in the table of results and an entry in ``failures``.
     """
@@ -123,7 +122,7 @@ def status(
     out: str | Path | None = None,
     data_root: str | Path | None = None,
 ) -> ExperimentStatus:
-    """Count the runs of an experiment file that are done, failed, missing or damaged. For the arguments see :func:`prepare`."""
+    """Return how many runs of an experiment file are ok, failed, missing or damaged. Arguments: see :func:`prepare`."""
     _, planned = prepare(file, changes, out=out, data_root=data_root)
     counts = {run.label: dict.fromkeys(STATES, 0) for run in planned.runs}
     for run in planned.runs:
@@ -143,13 +142,13 @@ def prepare(
     data_root: str | Path | None = None,
     out: str | Path | None = None,
 ) -> tuple[Experiment, Prepared[PlannedRun]]:
-    """Read an experiment file and plan its runs. Return the experiment, and the runs with the states of stored results.
+    """Return the content of an experiment file, and its planned runs with the states of their stored results.
 
     ``changes``: values that replace values of the file, see
     :func:`~factorgraph_loc.experiments.experiment_file.read_experiment`. ``data_root``: the data folder, None for the
     environment variable FGLOC_DATA. ``out``: folder of the results, None for the folder that the file names.
 
-    Raises InputError for errors in the file and for too many runs, and StoreError if the folder for results cannot be written.
+    Raises InputError for errors in the file and for too many runs, and StoreError if ``out`` cannot be written.
     """
     file = Path(file)
     experiment = read_experiment(file, changes)
@@ -170,10 +169,10 @@ def run_experiment(
     again: bool = False,
     progress: Callable[[int, int, int], None] = lambda _done, _total, _failed: None,
 ) -> Done:
-    """Execute the runs without stored results, and write the table of all results. ``again``: whether to repeat failed runs.
+    """Execute the runs without stored results, write the table of all results, and return the results.
 
-    For ``jobs``, ``scheduler`` and ``progress`` see :func:`experiment`. The table is written also after an error or an
-    interrupt. Raises StoreError if the store cannot be written.
+    ``again``: whether to repeat failed runs. For ``jobs``, ``scheduler`` and ``progress`` see :func:`experiment`. The
+    table is written also after an error or an interrupt. Raises StoreError if the store cannot be written.
     """
     from factorgraph_loc.experiments.result_table import collect, write_index  # noqa: PLC0415
 
@@ -210,9 +209,10 @@ def run_experiment(
 
 
 def estimate_seconds(runs: Sequence[PlannedRun], folder: Path) -> float:
-    """Estimate the total computing time [s] of runs, from the durations of their logs and from stored runs with the same label.
+    """Return an estimate of the total computing time [s] of runs, from the durations of their logs.
 
-    ``folder``: folder of the stored results. Without stored runs of a label, :data:`PACE` is assumed.
+    ``folder``: folder of the stored results. Stored runs with the same label show how fast an estimator is. Without
+    stored runs of a label, :data:`PACE` is assumed.
     """
     from factorgraph_loc.experiments.result_table import load_results  # noqa: PLC0415
 

@@ -69,7 +69,7 @@ def _is_scalar(value: Any) -> bool:
 
 
 def _seeds(value: Any) -> Any:
-    """Convert seeds to a tuple: "0:5" becomes (0, 1, 2, 3, 4), and 3 becomes (3,). Other values are returned unchanged."""
+    """Return seeds as a tuple: "0:5" becomes (0, 1, 2, 3, 4), and 3 becomes (3,). Other values are unchanged."""
     if isinstance(value, int) and not isinstance(value, bool):
         return (value,)
     if isinstance(value, str):
@@ -81,7 +81,7 @@ def _seeds(value: Any) -> Any:
 
 
 class LogEntry(FileModel):
-    """An entry of ``logs``: either recorded logs (``log``) or simulated logs (``simulate``).
+    """Logs in an experiment file: either recorded logs (``log``) or simulated logs (``simulate``).
 
     ``log``: a name that ``fgloc datasets`` lists, a path relative to the experiment file, or a glob of names or paths.
     With ``log`` there may be a ``reader`` with its ``options``, and files ``rig`` and ``world`` that replace those of
@@ -111,7 +111,7 @@ class LogEntry(FileModel):
 
 
 class EstimatorEntry(FileModel):
-    """An entry of ``estimators``: its ``name`` and ``settings``. ``label``: name in the results, "" for the name itself."""
+    """An estimator in an experiment file: ``name``, ``settings``, and ``label``, its name in the results if not ""."""
 
     name: Name
     label: str = ""
@@ -126,8 +126,9 @@ class EstimatorEntry(FileModel):
 class Sweep(FileModel):
     """The settings that an experiment varies.
 
-    ``over``: by dotted name of a setting, ``LABEL.KEY`` or ``simulation.KEY``, the list of its values. ``mode``: "grid" for all
-    combinations of the values. "list" combines the first values of all settings, then the second values, and so on.
+    ``over``: {name of a setting: list of its values}. The name is ``LABEL.KEY``, with the label of an estimator, or
+    ``simulation.KEY``. ``mode``: "grid" for all combinations of the values. "list" combines the first values of all
+    settings, then the second values, and so on.
     """
 
     mode: Literal["grid", "list"] = "grid"
@@ -157,10 +158,10 @@ class Sweep(FileModel):
         return self
 
     def points(self, *words: str) -> list[dict[str, Scalar]]:
-        """Return the combinations of values of swept settings, without duplicates. Each is a dictionary {dotted name: value}.
+        """Return the combinations of values of swept settings, without duplicates. Each is {dotted name: value}.
 
-        ``words``: only settings with names that start with one of these words are combined. Without ``words`` all settings are
-        combined. Without settings, the result is [{}]. At most :data:`MOST_RUNS` + 1 combinations are returned.
+        ``words``: only settings with names that start with one of these words are combined. Without ``words`` all
+        settings are combined. Without settings, the result is [{}]. At most :data:`MOST_RUNS` + 1 are returned.
         """
         columns = {key: values for key, values in self.over.items() if not words or key.partition(".")[0] in words}
         combined: Iterable[tuple[Scalar, ...]] = itertools.product(*map(dict.fromkeys, columns.values()))
@@ -170,7 +171,7 @@ class Sweep(FileModel):
 
 
 class ReportSettings(FileModel):
-    """Settings of the report. ``metrics``: keys of its scores. ``baseline``: label of the estimator to compare the others with."""
+    """Settings of the report. ``metrics``: keys of its scores. ``baseline``: label of the estimator to compare with."""
 
     metrics: Annotated[tuple[Name, ...], Field(min_length=1, max_length=MOST, fail_fast=True)] = SUMMARY
     baseline: str | None = None
@@ -189,14 +190,13 @@ class Limits(FileModel):
 class Experiment(FileModel):
     """The content of an experiment file.
 
-    ``name``: name of the experiment. ``out``: folder of the results, None for out/NAME.
-    ``logs``, ``estimators``: every estimator runs on every log.
-    ``sensors``: sets of used sensors. None means all sensors of the log's rig. Runs are made with each set.
-    ``prior``: prior of the start, see :func:`~factorgraph_loc.experiments.preparation.resolve_prior`.
-    ``seeds``: random seeds of the estimators.
-    ``max_gap`` [s]: for scores, estimates are not interpolated across longer gaps.
-    ``tick_gap`` [s]: in longer gaps between measurements there are no estimates.
-    ``align``: there are also scores after this alignment with the reference.
+    ``name``: name of the experiment. ``out``: folder of the results, None for out/NAME. ``logs``, ``estimators``: every
+    estimator runs on every log. ``sensors``: sets of used sensors. Runs are made with each set. A set of None means all
+    sensors of the log's rig. ``prior``: prior of the start, see
+    :func:`~factorgraph_loc.experiments.preparation.resolve_prior`. ``seeds``: random seeds of the estimators.
+    ``max_gap`` [s]: for scores, estimates are not interpolated across longer gaps. ``tick_gap`` [s]: in longer gaps
+    between measurements there are no estimates. ``align``: there are also scores after this alignment with the
+    reference. ``sweep``: settings to vary. ``report``: settings of the report. ``limits``: time and memory of a run.
     """
 
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$", max_length=LONGEST_NAME)]
@@ -221,7 +221,7 @@ class Experiment(FileModel):
     @field_validator("logs", "estimators", mode="before")
     @classmethod
     def _named(cls, value: Any, info: Any) -> Any:
-        """Convert entries of ``logs`` and ``estimators`` that are only a name to tables, such as {"name": "ekf"}."""
+        """Return entries of ``logs`` or ``estimators`` as tables: a name becomes a table such as {"name": "ekf"}."""
         key = "log" if info.field_name == "logs" else "name"
         return (
             [{key: entry} if isinstance(entry, str) else entry for entry in value] if isinstance(value, list) else value
@@ -253,7 +253,7 @@ class Experiment(FileModel):
 
 
 def write_new(file: Path, *, overwrite: bool = False) -> None:
-    """Write an example of an experiment file, with comments. Raises InputError if the file exists and ``overwrite`` is not set."""
+    """Write an example of an experiment file, with comments. Raises InputError if it exists, without ``overwrite``."""
     if file.suffix != ".toml":
         raise InputError(f"{file}: the name of an experiment file must end in .toml")
     if file.exists() and not overwrite:
@@ -262,7 +262,7 @@ def write_new(file: Path, *, overwrite: bool = False) -> None:
 
 
 def read_experiment(path: Path, changes: Mapping[str, Any] | None = None) -> Experiment:
-    """Read an experiment from a TOML file.
+    """Return the experiment in a TOML file.
 
     ``changes``: {dotted key: value} to replace values of the file. The key ``LABEL.KEY`` is a setting of an estimator,
     and ``simulation.KEY`` a setting of all simulated logs. Raises InputError with file and key if a value is invalid.
@@ -275,7 +275,7 @@ def read_experiment(path: Path, changes: Mapping[str, Any] | None = None) -> Exp
 
 
 def _change(content: dict[str, Any], key: str, value: Any, source: object) -> None:
-    """Set the value of a dotted key in the content of a file; see :func:`read_experiment`. ``source``: for messages."""
+    """Set the value of a dotted ``key`` in the content of a file, see :func:`read_experiment`. ``source``: its name."""
     first, _, rest = key.partition(".")
     if first in Experiment.model_fields:
         set_key(content, key, value, source)
@@ -293,7 +293,7 @@ def _change(content: dict[str, Any], key: str, value: Any, source: object) -> No
 
 
 def _tables(content: dict[str, Any], key: str, named: str, source: object) -> list[dict[str, Any]]:
-    """Return the list ``key`` in the content of a file. An entry that is only a name becomes a dictionary {``named``: name}.
+    """Return the list ``key`` in the content of a file. An entry that is only a name becomes {``named``: name}.
 
     Raises InputError if the value is not a list of names or tables.
     """

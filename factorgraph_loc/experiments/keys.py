@@ -37,7 +37,7 @@ _UNSETTLED = 2.0  # s; a file modified less than this time ago is not cached, be
 
 
 def digest_of(content: Any) -> str:
-    """Return the sha256 of data that JSON can represent, as hexadecimal digits."""
+    """Return the sha256 of ``content``, which JSON can represent, as hexadecimal digits."""
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
@@ -48,7 +48,7 @@ def code_version() -> str:
 
 
 def digest_of_code(root: Path) -> str:
-    """Return a hash of the source files of this project's packages in the folder ``root``, and of its descriptions of readers."""
+    """Return a hash of the source files of this project's packages below ``root``, and of descriptions of readers."""
     total = hashlib.sha256()
     for package in PACKAGES:
         for file in sorted((root / package).rglob("*")):
@@ -72,7 +72,10 @@ def software_digest() -> str:
 
 
 def run_key(log_digest: str, config: Mapping[str, Any]) -> str:
-    """Return the key of a run. ``log_digest``: hash of the log. ``config``: the configuration of the run, including defaults."""
+    """Return the key of a run: a hash of its log, its configuration and the software.
+
+    ``log_digest``: hash of the log. ``config``: the configuration of the run, including defaults.
+    """
     return digest_of({"log": log_digest, "config": dict(config), "software": software_digest()})
 
 
@@ -82,9 +85,9 @@ class VanishedError(InputError):
 
 @lru_cache(maxsize=4)
 def load_planned(source: LogSource, digest: str) -> Log:
-    """Load the log of a source. The last logs are cached, because consecutive runs often use the same log.
+    """Return the log of a source. The last logs are cached, because consecutive runs often use the same log.
 
-    ``digest``: hash of the log when the experiment was planned. Raises VanishedError if the log is missing or has changed.
+    ``digest``: hash of the log when the experiment was planned. Raises VanishedError if the log is missing or changed.
     """
     try:
         now = Facts().digest(source)
@@ -97,7 +100,7 @@ def load_planned(source: LogSource, digest: str) -> Log:
 
 @dataclass(frozen=True)
 class LogFacts:
-    """Facts about a log: its ``name``, its ``duration`` [s], and the names of its ``sensors``."""
+    """Properties of a log: its ``name``, its ``duration`` [s], and the names of its ``sensors``."""
 
     name: str
     duration: float
@@ -106,17 +109,18 @@ class LogFacts:
 
 @dataclass(frozen=True)
 class EstimatorFacts:
-    """Facts about an estimator. ``effective``: all its settings. ``deterministic``: True if it uses no random numbers."""
+    """Properties of an estimator. ``effective``: all its settings. ``deterministic``: if it uses no random numbers."""
 
     effective: Mapping[str, Any]
     deterministic: bool
 
 
 class _Kept(BaseModel):
-    """The content of a cache of facts. ``version``: hash of the code and libraries that computed them.
+    """The content of a cache of hashes of files, and of properties of logs and estimators.
 
-    ``files``: by path, the size, modification time and sha256 of a file. ``logs``: by hash of a source, facts about its
-    logs. ``estimators``: facts about an estimator, by its name and settings as text.
+    ``version``: hash of the code and libraries that computed them. ``files``: by path, the size, modification time and
+    sha256 of a file. ``logs``: by hash of a source, properties of its logs. ``estimators``: by name and settings as
+    text, properties of an estimator.
     """
 
     version: str = ""
@@ -126,9 +130,9 @@ class _Kept(BaseModel):
 
 
 class Facts:
-    """Computes hashes of files, and facts about logs and estimators.
+    """Computes hashes of files, and properties of logs and estimators.
 
-    ``cache``: a JSON file that stores the results, or None. They are used again if files, code and libraries are unchanged.
+    ``cache``: a JSON file of stored values, or None. They are used again if files, code and libraries are unchanged.
     """
 
     def __init__(self, cache: Path | None = None) -> None:
@@ -160,27 +164,28 @@ class Facts:
         return digest
 
     def logs(self, source: LogSource, digest: str) -> list[LogFacts]:
-        """Return facts about all logs of a source with the hash ``digest``. Raises InputError if it cannot be loaded."""
+        """Return properties of all logs of a source with the hash ``digest``. Raises InputError if they cannot be
+        loaded."""
         if digest not in self._known.logs:
             self._known.logs[digest] = [_facts(log) for log in source.load_all()]
         return self._known.logs[digest]
 
     def estimator(self, name: str, settings: Mapping[str, Any]) -> EstimatorFacts:
-        """Return facts about an estimator with these settings. Raises InputError for an unknown name or invalid settings."""
+        """Return the properties of the estimator ``name`` with ``settings``. Raises InputError if either is invalid."""
         key = f"{name} {canonical(settings)}"
         if key not in self._known.estimators:
             self._known.estimators[key] = _of_estimator(name, settings)
         return self._known.estimators[key]
 
     def save(self) -> None:
-        """Write the facts to the cache, if there is one. Errors of writing are ignored."""
+        """Write all values to the cache, if there is one. Errors of writing are ignored."""
         if self._cache is not None:
             with suppress(OSError):
                 write_text(self._cache, json.dumps(self._known.model_dump()))
 
 
 def _kept(cache: Path) -> _Kept:
-    """Read a cache. Return an empty one if it is missing, damaged, or was made by other code or libraries."""
+    """Return the content of a cache. It is empty if the file is missing, damaged, or from other code or libraries."""
     with suppress(InputError, ValidationError):
         kept = _Kept.model_validate_json(bounded.read_bytes(cache, bounded.DATA))
         if kept.version == software_digest():
@@ -189,7 +194,7 @@ def _kept(cache: Path) -> _Kept:
 
 
 def _facts(log: Any) -> LogFacts:
-    """Return facts about a loaded log."""
+    """Return the name, duration and sensors of a loaded log."""
     from factorgraph_loc.experiments.preparation import columns_of  # noqa: PLC0415
 
     first, last = log.span()
@@ -197,7 +202,7 @@ def _facts(log: Any) -> LogFacts:
 
 
 def _of_estimator(name: str, settings: Mapping[str, Any]) -> EstimatorFacts:
-    """Return facts about an estimator. This imports the estimator, which takes time."""
+    """Return the properties of an estimator. This imports the estimator, which takes time."""
     from factorgraph_loc.fusion import registry  # noqa: PLC0415
 
     effective = registry.settings_of(name, settings).model_dump(mode="json")

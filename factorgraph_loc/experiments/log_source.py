@@ -41,7 +41,7 @@ def is_pattern(name: str) -> bool:
 
 
 def matching(pattern: str, folder: Path, source: object) -> list[Path]:
-    """Return the sorted paths that match a glob. ``folder``: a relative glob starts here. ``source``: name for messages.
+    """Return the sorted paths that match a glob. ``folder``: start of a relative glob. ``source``: name for messages.
 
     Raises InputError for an invalid glob.
     """
@@ -58,24 +58,24 @@ def _fixed_part(pattern: str) -> str:
 
 
 class LogSource(ABC):
-    """The source of a log. A source may contain several logs; ``number`` is the index of the log."""
+    """A description of how to load a log. A file may contain several logs; ``number`` is the index of the log."""
 
     number: int = 0
 
     @abstractmethod
     def load_all(self) -> list[Log]:
-        """Load all logs of the source. Raises InputError if they cannot be read or simulated."""
+        """Return all logs of the source. Raises InputError if they cannot be read or simulated."""
 
     @abstractmethod
     def files(self) -> dict[str, Path]:
-        """Return the files of the log, by names that do not depend on their location."""
+        """Return {name: path} of the files of the log. The names do not depend on the location of the files."""
 
     @abstractmethod
     def identity(self) -> dict[str, Any]:
         """Return the values that determine the log, together with the content of its files."""
 
     def load(self) -> Log:
-        """Load the log."""
+        """Return the log with the index ``number``."""
         return self.load_all()[self.number]
 
 
@@ -115,7 +115,7 @@ class RecordedSource(LogSource):
         return {"log": name, "number": self.number, "reader": self.reader, "options": json.loads(self.options)}
 
     def _data(self) -> Iterator[tuple[str, Path]]:
-        """Yield names and paths of the files of the log, except for ``self.rig`` and ``self.world``."""
+        """Yield (name, path) of each file of the log, except for ``self.rig`` and ``self.world``."""
         path = Path(self.log)
         if self.log in manifests():
             path = manifests()[self.log]
@@ -147,7 +147,8 @@ class RecordedSource(LogSource):
 
 @dataclass(frozen=True)
 class SimulatedSource(LogSource):
-    """A simulated log. ``preset``: a name or a TOML file. ``settings``: changed settings as JSON. ``seed``: random seed."""
+    """A simulated log. ``preset``: a name or a TOML file. ``settings``: changed settings as JSON. ``seed``: of the
+    noise."""
 
     preset: str
     settings: str = "{}"
@@ -183,10 +184,11 @@ class GivenSource(LogSource):
 
 
 def recorded_sources(name: str, folder: Path, **options: Any) -> list[RecordedSource]:
-    """Return the sources for a name in an experiment file: a known name, a path relative to ``folder``, or a glob for either.
+    """Return the sources of the logs with a name in an experiment file.
 
-    ``options``: values of other fields of :class:`RecordedSource`. Raises InputError if a glob matches no log, or if a path
-    leads out of ``folder`` and of the data folder.
+    ``name``: a name that ``fgloc datasets`` lists, a path relative to ``folder``, or a glob of names or paths.
+    ``options``: values of other fields of :class:`RecordedSource`. Raises InputError if a glob matches no log, or if a
+    path leads out of ``folder`` and of the data folder.
     """
     known = manifests()
     if name in known:
@@ -208,7 +210,7 @@ def recorded_sources(name: str, folder: Path, **options: Any) -> list[RecordedSo
 
 
 def _is_log(path: Path) -> bool:
-    """True if a path is a manifest, or a log in the native format."""
+    """True if a path is a dataset manifest, or a log in the native format."""
     if path.is_dir():
         return (path / RUN_FILE).is_file()
     return path.name == RUN_FILE or (
@@ -217,14 +219,14 @@ def _is_log(path: Path) -> bool:
 
 
 def _of_folder(folder: Path) -> Iterator[tuple[str, Path]]:
-    """Yield names and paths of all files in a folder and its subfolders."""
+    """Yield (name, path) of each file in a folder and its subfolders."""
     for file in sorted(folder.rglob("*")):
         if file.is_file():
             yield f"{folder.name}/{file.relative_to(folder).as_posix()}", file
 
 
 def _of_toml(path: str | None) -> Iterator[tuple[str, Path]]:
-    """Yield names and paths of a file of settings, and of the files that it names. This is repeated for each of those files."""
+    """Yield (name, path) of a file of settings, and of all files that it names directly or indirectly."""
     if path is None:
         return
     folder = Path(path).parent

@@ -67,14 +67,14 @@ class MapOptions:
     """How a map is made.
 
     ``of``: landmarks, tags or points. None: points if the log has images, landmarks if it has measurements of
-    landmarks, else tags. ``estimator``, ``settings``: the estimator of landmarks, and its settings.
-    ``points``: settings of a map of points, fields of :class:`~factorgraph_loc.mapping.point_mapping.PointSettings`.
-    ``extend``: whether to keep the log's map and to add what it lacks.
-    ``poses``: source of the robot poses for a map of tags: "reference", or "odometry" to estimate the poses together
-    with the tags. None: "reference" if the log has one, else "odometry".
-    ``height`` [m]: height of tags or landmarks that the log's map lacks, None for the height of the antennas or of the
-    radio. ``drop_dead``: if set, nothing is mapped, and the log's map is written without the tags that are believed
-    dead. ``prior``: prior of the start, see :func:`~factorgraph_loc.experiments.preparation.resolve_prior`.
+    landmarks, else tags. ``estimator``, ``settings``: the estimator of landmarks, and its settings. ``points``:
+    settings of a map of points, fields of :class:`~factorgraph_loc.mapping.point_mapping.PointSettings`. ``extend``:
+    whether to keep the log's map and to add missing objects. ``poses``: source of the robot poses for a map of tags:
+    "reference", or "odometry" to estimate the poses together with the tags. None: "reference" if the log has one, else
+    "odometry". ``height`` [m]: height of new tags or landmarks, None for the height of the antennas or of the radio.
+    ``drop_dead``: make no new map, but remove dead tags from the log's map. A dead tag is never read, although the
+    smoother expects reads. ``prior``: prior of the start, see
+    :func:`~factorgraph_loc.experiments.preparation.resolve_prior`.
     """
 
     of: str | None = None
@@ -90,8 +90,8 @@ class MapOptions:
 
 @dataclass(frozen=True)
 class DroppedTags:
-    """The result of the removal of dead tags. ``dropped``: by removed tag, its probability of being dead. ``kept``:
-    number of the remaining tags."""
+    """The result of the removal of dead tags from a map. ``dropped``: {removed tag: probability that it is dead}.
+    ``kept``: number of the remaining tags."""
 
     dropped: Mapping[str, float]
     kept: int
@@ -101,7 +101,7 @@ class DroppedTags:
 class MadeMap:
     """A new map. ``world``: its content. ``frame``: a description of its frame. ``details``: results of the mapping.
 
-    ``warnings``: warnings about the log and the run. ``draw``: returns a plot of the map.
+    ``warnings``: warnings about the log and the run. ``draw``: a function that returns a plot of the map.
     """
 
     world: World
@@ -111,7 +111,7 @@ class MadeMap:
     draw: Callable[[], Figure]
 
     def write(self, out: Path, *, overwrite: bool = False) -> None:
-        """Write the map to ``out``, and its plot next to it. Raises InputError as :func:`plot_path`, or if writing fails."""
+        """Write the map to ``out``, and its plot next to it. Raises InputError as :func:`plot_path`, or on failure."""
         picture = plot_path(out, overwrite=overwrite)
         with writing(out), replacing(picture) as temporary:  # so that either both files are written, or none
             temporary.write_bytes(png_bytes(self.draw()))
@@ -121,16 +121,16 @@ class MadeMap:
 def plot_path(out: Path, *, overwrite: bool) -> Path:
     """Return the path of the plot of a map with the path ``out``.
 
-    Raises InputError if the name of the map does not end in :data:`SUFFIX`, or a file exists and ``overwrite`` is not set.
+    Raises InputError if ``out`` does not end in :data:`SUFFIX`, or a file exists and ``overwrite`` is not set.
     """
     return with_ending(out, SUFFIX, ".map.png", overwrite=overwrite)
 
 
 def make_map(log: Log, options: MapOptions | None = None, progress: Progress = lambda _share: None) -> MadeMap:
-    """Make a map from a log. If the log has a map already, it is compared with the new map, or extended.
+    """Return a map made from a log. If the log has a map already, it is compared with the new map, or extended.
 
-    ``progress``: called with the fraction done. Raises InputError if options contradict each other or do not fit the
-    log, and RunFailedError if nothing could be located.
+    ``progress``: called with the completed fraction. Raises InputError if options contradict each other or do not fit
+    the log, and RunFailedError if nothing could be located.
     """
     options = options or MapOptions()
     if options.drop_dead:
@@ -144,7 +144,7 @@ def make_map(log: Log, options: MapOptions | None = None, progress: Progress = l
 def _mapped_kind(log: Log, options: MapOptions) -> str:
     """Return the kind of map to make: ``options.of``, or the kind that other options imply, or the default for the log.
 
-    Raises InputError if an option belongs to another kind.
+    Raises InputError if an option applies only to another kind.
     """
     if options.of not in (None, *KINDS):
         raise InputError(f"--of is {quoted(options.of)}, expected {' or '.join(KINDS)}")
@@ -162,7 +162,8 @@ def _mapped_kind(log: Log, options: MapOptions) -> str:
 
 
 def _usual_kind(log: Log, *, extend: bool) -> str:
-    """Return the default kind of map for a log. ``extend``: if set, points are mapped only if the log's map has points."""
+    """Return the default kind of map for a log: points, landmarks or tags. ``extend``: points are the default only if
+    the log's map has points."""
     known = _mappable(log) - ({POINTS} if extend and log.world.points is None else set())
     return next((kind for kind in KINDS if kind in known), "landmarks")
 
@@ -178,7 +179,7 @@ def _mappable(log: Log) -> set[str]:
 
 
 def _of_landmarks(log: Log, options: MapOptions, progress: Progress) -> MadeMap:
-    """Make a map of landmarks by a run of an estimator."""
+    """Return a map of landmarks, made by a run of an estimator."""
     estimator, settings = options.estimator, dict(options.settings)
     if estimator not in MAP_ESTIMATORS:
         raise InputError(
@@ -224,7 +225,7 @@ def _at_height(world: World, names: Iterable[str], height: float | None) -> Worl
 
 
 def _of_tags(log: Log, options: MapOptions, progress: Progress) -> MadeMap:
-    """Make a map of RFID tags."""
+    """Return a map of RFID tags, made with the poses of the reference or with estimated poses."""
     uses_reference = _uses_reference(options, has_reference=log.reference is not None)
     if options.extend and not log.world.tags:
         raise InputError(f"{log.name}: has no map of tags that --extend could extend: remove --extend")
@@ -253,7 +254,7 @@ def _without_dead(log: Log, options: MapOptions, progress: Progress) -> MadeMap:
 
 
 def _of_points(log: Log, options: MapOptions, progress: Progress) -> MadeMap:
-    """Make a map of points from images along the reference."""
+    """Return a map of points, made from the images of a log and the poses of its reference."""
     camera = log.rig.find(CameraSettings)
     if camera is None:
         raise InputError(f"{log.name}: its rig {log.rig.name} has no [camera], so that its images cannot be mapped")
@@ -288,10 +289,8 @@ def _uses_reference(options: MapOptions, *, has_reference: bool) -> bool:
 
 
 def _started_exactly(log: Log, prior: str | None) -> tuple[Log, str]:
-    """Return the log with a start pose that is known exactly, and a description of the start.
-
-    The start is exact, because it defines the frame of the map.
-    """
+    """Return the log with a start pose that is known exactly, and a description of the start. ``prior``: as in
+    :class:`MapOptions`. The start is exact, because it defines the frame of the map."""
     start, source = resolve_prior(log, prior)
     if start is None:
         t, pose, source = first_odometry(log), np.zeros(3), "the first pose is the origin (0, 0, 0)"
@@ -303,7 +302,7 @@ def _started_exactly(log: Log, prior: str | None) -> tuple[Log, str]:
 def _start_of_tags(log: Log, options: MapOptions) -> tuple[PosePrior | None, str]:
     """Return the prior of the start for a map of tags without a reference, and a description of the map's frame.
 
-    The prior is None if the start is unknown. If the log's map is not extended, the start is exact, because it defines the frame.
+    The prior is None if the start is unknown. The start of a new map is exact, because it defines the frame.
     """
     prior, source = resolve_prior(log, options.prior)
     if prior is None or (options.extend and not prior.has_heading):
@@ -316,7 +315,7 @@ def _start_of_tags(log: Log, options: MapOptions) -> tuple[PosePrior | None, str
 
 
 def _describe_start(start: PosePrior, source: str) -> str:
-    """Describe a start pose and its source."""
+    """Return a description of a start pose. ``source``: "log", "reference" or another value of the prior."""
     x, y, heading = start.pose
     chosen = "" if start.has_heading else ", which has no heading"
     source = SOURCES.get(source, "--prior")

@@ -92,8 +92,8 @@ def write_run(
 def save_run(
     result: RunResult, log: Log, out: Path, *, align: Alignment = "none", overwrite: bool = False
 ) -> dict[str, Any]:
-    """Write the files of a run as :func:`write_run`. If that fails, write them to a new temporary folder instead, and
-    raise an InputError that names this folder."""
+    """Write the files of a run as :func:`write_run`, and return the scores. If that fails, write them to a new
+    temporary folder instead, and raise an InputError that names this folder."""
     try:
         return write_run(result, log, out, align=align, overwrite=overwrite)
     except InputError as error:
@@ -104,7 +104,7 @@ def save_run(
 
 
 def _keep(result: RunResult, log: Log, align: Alignment) -> Path | None:
-    """Write the files of a run to a new folder in the temporary folder of the system. Return the folder, or None on failure."""
+    """Write the files of a run to a new temporary folder of the system. Return the folder, or None on failure."""
     folder = None
     try:
         folder = Path(tempfile.mkdtemp(prefix="fgloc-run-"))
@@ -117,7 +117,7 @@ def _keep(result: RunResult, log: Log, align: Alignment) -> Path | None:
 
 
 def write_files(result: RunResult, log: Log, scores: Mapping[str, Any], folder: Path) -> None:
-    """Write the files of a run into an empty folder, except for a map; see :func:`write_run`. ``scores``: of the run."""
+    """Write the files of a run, see :func:`write_run`, into an empty folder, except for a map. ``scores``: by key."""
     causal = result.causal() or Trajectory(np.empty(0), np.empty((0, 3)))
     write_tum(result.final, folder / FINAL, log.t0_ns)
     write_tum(causal, folder / CAUSAL, log.t0_ns)
@@ -145,7 +145,7 @@ def map_of(result: RunResult, log: Log) -> World | None:
 
 
 def with_ending(out: Path, suffix: str, ending: str, *, overwrite: bool) -> Path:
-    """Return the path of a second file next to ``out``: its ``suffix`` is replaced by ``ending``.
+    """Return the path of a second file next to ``out``, with ``ending`` in place of the ``suffix`` of ``out``.
 
     Raises InputError if ``out`` has another suffix, its folder is missing, or either file exists without ``overwrite``.
     """
@@ -217,8 +217,8 @@ def _rows(
     update_ms: Array,
     flags: pl.DataFrame,
 ) -> pl.DataFrame:
-    """Return the rows of ``estimates.parquet`` for one ``kind`` of trajectory. ``flags``: the columns ``status`` and
-    ``doubts_model``."""
+    """Return the rows of ``estimates.parquet`` for one ``kind`` of trajectory, "causal" or "final". ``update_ms`` (N,):
+    its column. ``flags``: its columns ``status`` and ``doubts_model``."""
     n = len(trajectory)
     covariances = trajectory.covariances if trajectory.covariances is not None else np.full((n, 3, 3), np.nan)
     position, heading, nees = np.full((3, n), np.nan)
@@ -253,10 +253,10 @@ def _slowest_update(result: RunResult) -> Array:
 
 
 def run_files(result: RunResult, log: Log, started: float, align: Alignment = "none") -> dict[str, bytes]:
-    """Return the files of a run as {file name: content}, for the store of an experiment.
+    """Return the files of a run as {file name: content}, to be stored with an experiment.
 
     They are the files of :func:`write_run`. Computing times are in a separate file and ``update_ms`` is empty, so that
-    all other files are reproducible. ``started``: value of ``perf_counter`` at the start of the run.
+    all other files are reproducible. ``started`` [s]: value of ``perf_counter`` at the start of the run.
     """
     scores = score(result, log, align)
     timings = {name: value for name, value in scores.items() if name.startswith(TIMING)}
@@ -268,7 +268,7 @@ def run_files(result: RunResult, log: Log, started: float, align: Alignment = "n
 
 
 def write_tables(table: pl.DataFrame, differences: pl.DataFrame, text: str, out: Path) -> None:
-    """Write :data:`TABLES` into ``out``: the runs ``table``, the ``differences`` of methods, and ``text`` (table.md)."""
+    """Write :data:`TABLES` into ``out``: the runs (``table``), ``differences`` of methods, and ``text`` (table.md)."""
     write_text(out / "results.csv", plain_lines(table.write_csv()))
     write_text(out / "differences.csv", plain_lines(differences.write_csv()))
     write_text(out / "table.md", plain_lines(text))

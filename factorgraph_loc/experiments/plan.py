@@ -34,8 +34,8 @@ from factorgraph_loc.text import quoted
 class PlannedRun(RunConfig):
     """A planned run of an estimator on a log, which can be sent to other processes.
 
-    ``source``: source of the log. ``log_digest``: hash of its content. ``log``: name of the log. ``duration`` [s]: of the log.
-    ``label``: label of the estimator. ``sweep``: by dotted name, the values of swept settings. ``key``: key of the results.
+    ``source``: how to load the log. ``log_digest``: hash of its content. ``log``: its name. ``duration`` [s]: of the
+    log. ``label``: of the estimator. ``sweep``: {dotted name: value} of swept settings. ``key``: key of the results.
     """
 
     source: LogSource
@@ -83,7 +83,7 @@ class PlannedRun(RunConfig):
 
 @dataclass(frozen=True)
 class _PlannedLog(LogFacts):
-    """Facts about a log, its source, and the hash of its content."""
+    """Properties of a log, how to load it (``source``), and the hash of its content (``digest``)."""
 
     source: LogSource
     digest: str
@@ -97,11 +97,11 @@ def plan(
     *,
     given: Sequence[LogSource] = (),
 ) -> list[PlannedRun]:
-    """Return all runs of an experiment.
+    """Return all planned runs of an experiment.
 
-    ``folder``: paths in the experiment are relative to it. ``cache``: folder for cached facts about logs and
-    estimators. ``data_root``: the data folder, None for the environment variable FGLOC_DATA. ``given``: sources of logs
-    to use instead of the logs of the experiment.
+    ``folder``: paths in the experiment are relative to it. ``cache``: folder for a cache of hashes of files and of
+    properties of logs and estimators. ``data_root``: the data folder, None for the environment variable FGLOC_DATA.
+    ``given``: sources of logs to use instead of the logs of the experiment.
 
     Swept settings of one estimator do not multiply the runs of other estimators. Deterministic estimators run only with
     the first seed.
@@ -130,7 +130,7 @@ def plan(
 
 
 def _all_runs(experiment: Experiment, recorded: Mapping[int, Sequence[LogSource]], facts: Facts) -> list[PlannedRun]:
-    """Return all runs of an experiment. ``recorded``: by index in ``experiment.logs``, the sources of recorded logs."""
+    """Return all runs of an experiment. ``recorded``: {index in ``experiment.logs``: sources of recorded logs}."""
     sweep = experiment.sweep
     of_others = {entry.shown: sweep.points(entry.shown, entry.name) for entry in experiment.estimators}
     of_simulated = {entry.shown: _by_simulation(sweep, entry) for entry in experiment.estimators}
@@ -178,8 +178,8 @@ def _check_count(count: int, experiment: Experiment) -> None:
 
 
 def _by_simulation(sweep: Sweep, entry: EstimatorEntry) -> dict[tuple[Any, ...], list[dict[str, Scalar]]]:
-    """Return the combinations of swept settings of an estimator and of simulated logs, as {key: combinations}. A key is
-    the tuple of the values of the settings of the simulation."""
+    """Return the combinations of swept settings of an estimator and of the simulation, by values of the latter. A key
+    is the tuple of the values of the swept settings of the simulation."""
     points: dict[tuple[Any, ...], list[dict[str, Scalar]]] = {}
     for swept in sweep.points(SIMULATION, entry.shown, entry.name):
         points.setdefault(tuple(_part(swept, (SIMULATION,)).values()), []).append(swept)
@@ -189,7 +189,7 @@ def _by_simulation(sweep: Sweep, entry: EstimatorEntry) -> dict[tuple[Any, ...],
 def _runs(
     experiment: Experiment, log: _PlannedLog, entry: EstimatorEntry, point: Mapping[str, Any], facts: Facts
 ) -> Iterator[PlannedRun]:
-    """Yield the runs of an estimator on a log: one per set of sensors and seed. ``point``: values of swept settings."""
+    """Yield the runs of an estimator on a log, one per set of sensors and seed. ``point``: {swept setting: value}."""
     settings = _settings(entry, point)
     estimator = facts.estimator(entry.name, settings)
     for sensors in experiment.sensors:
@@ -241,7 +241,7 @@ def _recorded(entry: LogEntry, folder: Path, data_root: str | None) -> list[Reco
 
 
 def _simulated(entry: LogEntry, point: Mapping[str, Any]) -> list[SimulatedSource]:
-    """Return one source per seed for an entry with simulated logs. ``point``: {dotted name: value} of swept settings."""
+    """Return a source of simulated logs for each seed of an ``entry``. ``point``: {swept setting: value}."""
     assert entry.simulate is not None
     settings = json.loads(canonical(entry.settings))
     for key, value in point.items():
@@ -258,7 +258,7 @@ def _logs(sources: Sequence[LogSource], facts: Facts) -> Iterator[_PlannedLog]:
 
 
 def _settings(entry: EstimatorEntry, point: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the settings of an estimator, with the values of its swept settings in ``point`` {dotted name: value}."""
+    """Return the settings of an estimator with its swept values. ``point``: {dotted name: value} of swept settings."""
     settings: dict[str, Any] = json.loads(canonical(entry.settings))
     for key, value in _part(point, (entry.shown, entry.name)).items():
         set_key(settings, key.partition(".")[2], value, "the sweep")
@@ -266,7 +266,7 @@ def _settings(entry: EstimatorEntry, point: Mapping[str, Any]) -> dict[str, Any]
 
 
 def _part(point: Mapping[str, Any], words: Sequence[str]) -> dict[str, Any]:
-    """Return those swept settings in ``point`` {dotted name: value} that have a name starting with one of ``words``."""
+    """Return the swept settings in ``point`` {dotted name: value} with a name that starts with one of ``words``."""
     return {key: value for key, value in point.items() if key.partition(".")[0] in words}
 
 

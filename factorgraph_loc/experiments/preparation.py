@@ -22,12 +22,12 @@ SET_PRIOR = "set the prior (--prior) to"  # last part of messages about the star
 
 
 def resolve_prior(log: Log, prior: str | None) -> tuple[PosePrior | None, str]:
-    """Return the Gaussian prior of the start pose of a run, and the name of its source. The prior of an unknown start is None.
+    """Return the Gaussian prior of the start pose of a run (None if the start is unknown), and the name of its source.
 
     ``prior`` is one of these:
 
-    - "reference": the first pose of the reference at or after the first odometry, with standard deviations of 0.02 m and 0.01 rad.
-      If the reference has no headings, the heading is unknown.
+    - "reference": the first pose of the reference at or after the first odometry, with standard deviations of 0.02 m
+      and 0.01 rad. If the reference has no headings, the heading is unknown.
     - "log": the start pose in the log.
     - "X,Y,HEADING" [m, m, rad]: a pose at the first odometry, with standard deviations of 0.05 m and 0.05 rad.
     - "X,Y" [m]: a position at the first odometry, with unknown heading.
@@ -55,7 +55,7 @@ def resolve_prior(log: Log, prior: str | None) -> tuple[PosePrior | None, str]:
 
 
 def at_origin(log: Log) -> PosePrior:
-    """Return the prior of a start pose (0, 0, 0) at the first odometry. It is exact, because it defines the frame."""
+    """Return an exact prior of the pose (0, 0, 0) at the first odometry, where the start defines the frame."""
     return PosePrior(first_odometry(log), np.zeros(3), _covariance(EXACT_SIGMA, EXACT_SIGMA))
 
 
@@ -71,7 +71,7 @@ def first_odometry(log: Log) -> float:
 
 
 def _from_reference(log: Log) -> PosePrior:
-    """Return a prior at the first pose of the reference at or after the first odometry. Raises InputError without such a pose."""
+    """Return a prior at the first reference pose at or after the first odometry. Raises InputError if there is none."""
     if log.reference is None:
         raise InputError(
             f"{log.name}: has no reference to start from: {SET_PRIOR} 'log', 'X,Y,HEADING', 'X,Y' or 'unknown'"
@@ -90,12 +90,12 @@ def _from_reference(log: Log) -> PosePrior:
 
 
 def _covariance(position_sigma: float, heading_sigma: float) -> np.typing.NDArray[np.float64]:
-    """Return the covariance (3, 3) of a pose from standard deviations [m, rad]."""
+    """Return the covariance (3, 3) of a pose (x, y, heading) from standard deviations [m, rad]."""
     return np.diag(np.square((position_sigma, position_sigma, heading_sigma)))
 
 
 def columns_of(streams: Iterable[str]) -> tuple[str, ...]:
-    """Return the names of the sensors that are optional columns of ``streams``, such as the signal strength of RFID reads."""
+    """Return the names of the sensors that are optional columns of ``streams``, such as the RSSI of RFID reads."""
     available = set(streams)
     return tuple(name for name in channels() if parent_of(name) in available)
 
@@ -131,7 +131,7 @@ def used_sensors(log: Log, asked: tuple[str, ...] | None) -> tuple[str, ...]:
 
 
 def unused(log: Log, sensors: tuple[str, ...]) -> tuple[Notice, ...]:
-    """Return warnings about sensors of the rig that cannot be used, and about used ``sensors`` without odometry."""
+    """Return warnings about sensors of the rig that cannot be used. Also warn if the used ``sensors`` lack odometry."""
     available = (*log.streams, *_filled_columns(log))
     sentence = "{log}: the rig lists the sensor {sensor}, the log has none"
     doubts = [notice("no_stream", sentence, log.name, s) for s in log.rig.sensors if s not in available]
@@ -148,15 +148,18 @@ def unused(log: Log, sensors: tuple[str, ...]) -> tuple[Notice, ...]:
 
 
 def use_of(log: Log, sensors: Sequence[str], estimator: str, settings: FileModel, given: Collection[str] = ()) -> Use:
-    """Return the description of a run for :func:`checked_use`. ``given``: names of the settings that the user has set."""
+    """Return the log, sensors, estimator and settings of a run as one object, for :func:`checked_use`.
+
+    ``given``: names of the settings that the user has set.
+    """
     kind = registry.estimator_type(estimator)
     modalities = getattr(kind, "modalities", frozenset[str]())
     return Use(log, tuple(sensors), estimator, settings, modalities, getattr(kind, "estimates_points", False), given)
 
 
 def checked_use(use: Use) -> Use:
-    """Check that the settings of a run fit its log, by the function ``check`` of each sensor package. Return the run
-    with the settings and warnings that these functions have changed.
+    """Return the description of a run, with settings and warnings that the sensor packages have changed. Each sensor
+    package has a function ``check``, which compares the settings with the log.
 
     Raises InputError if a setting does not fit the log.
     """

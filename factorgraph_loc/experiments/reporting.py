@@ -25,7 +25,7 @@ PAGE = "report.html"
 
 @dataclass(frozen=True)
 class Report:
-    """A written report. ``page``: its path. ``damaged``: descriptions of runs with damaged results, which it excludes."""
+    """A written report. ``page``: its path. ``damaged``: descriptions of damaged runs, which the report excludes."""
 
     page: Path
     damaged: list[str]
@@ -38,7 +38,7 @@ def report(
     out: str | Path | None = None,
     data_root: str | Path | None = None,
 ) -> Report:
-    """Write the results of an experiment as an HTML page into its folder. Damaged results are listed there, but not used.
+    """Write the results of an experiment as an HTML page into its folder. Damaged results are listed, but not used.
 
     For the arguments see :func:`~factorgraph_loc.experiments.experiment.prepare`.
     """
@@ -81,7 +81,7 @@ def report_experiment(experiment: Experiment, prepared: Prepared[PlannedRun]) ->
 
 
 def _scene(run: PlannedRun, kept: Path) -> Scene | None:
-    """Return the map and reference of a run's log, cached in the file ``kept``. None if the log cannot be read."""
+    """Return the map and reference of a run's log. ``kept``: file that caches them. None if the log cannot be read."""
     with suppress(OSError, ValueError):
         return Scene.model_validate_json(kept.read_bytes())
     try:

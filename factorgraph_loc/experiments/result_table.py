@@ -18,7 +18,7 @@ TEXTS = {"label", "log", "estimator", "sensors", "prior", "status", "kind", "rea
 
 
 def collect(runs: Iterable[Planned], store: Store) -> pl.DataFrame:
-    """Return the table of stored runs; see :func:`load_results`. Raises DamagedError if a result is damaged."""
+    """Return a table of stored runs, see :func:`load_results`. Raises DamagedError if a result is damaged."""
     rows = [run.columns | store.row(run.key) for run in runs]
     keys = dict.fromkeys(key for row in rows for key in row) or dict.fromkeys(sorted(TEXTS))
     table = pl.DataFrame(rows, schema=list(keys), infer_schema_length=None)
@@ -37,14 +37,15 @@ def write_index(table: pl.DataFrame, folder: Path) -> None:
 
 
 def load_results(path: str | Path) -> pl.DataFrame:
-    """Load the results of an experiment from the folder ``path``, as a table with a row for each run.
+    """Return the results of an experiment as a table with a row for each run. ``path``: folder of the results.
 
     The columns are:
 
-    - ``label``, ``log``, ``estimator``, ``prior``, ``seed``. ``sensors``: separated by commas, null for the rig's sensors.
+    - ``label``, ``log``, ``estimator``, ``prior``, ``seed``. ``sensors``: separated by commas, null for the rig's
+      sensors.
     - ``sweep.KEY``: value of each swept setting, null if it does not apply to the run.
     - ``status``: ok or failed. ``kind`` (error, timeout, memory, killed, vanished), ``reason``: of a failure.
-    - ``key``: key of the results in the store. ``duration`` [s]: of the log. ``warnings``: a text with one warning per line.
+    - ``key``: key of the stored files. ``duration`` [s]: of the log. ``warnings``: a text with one warning per line.
     - the scores of :func:`~factorgraph_loc.evaluation.metrics.score`, null for failed runs.
 
     Raises InputError if there are no results.

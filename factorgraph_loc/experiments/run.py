@@ -51,21 +51,21 @@ def run(
     progress: Callable[[float], None] | None = None,
     watch: Callable[[float, Estimator], None] | None = None,
 ) -> RunResult:
-    """Run an estimator on a log.
+    """Run an estimator on a log, and return the estimated trajectories with diagnostics and warnings.
 
-    ``progress``: called with the fraction done. If features are extracted from images, this is the first half. ``watch``:
-    called with the time and the estimator after each tick, for instance to inspect its belief.
+    ``progress``: called with the completed fraction. If features are extracted from images, this is the first half.
+    ``watch``: called with the time [s] and the estimator after each tick, for instance to inspect its belief.
 
     Causal estimates are recorded at ticks. Ticks are at 10 Hz from the time of the prior on, except inside gaps between
-    measurements longer than ``config.tick_gap``. The estimator processes all measurements that arrive up to a tick before the
-    estimate is recorded. Odometry older than the prior determines the initial velocity. Other measurements older than the
-    prior are counted as ignored.
+    measurements longer than ``config.tick_gap``. The estimator processes all measurements that arrive up to a tick
+    before the estimate is recorded. Odometry older than the prior determines the initial velocity. Other measurements
+    older than the prior are counted as ignored.
 
-    With an unknown start, ticks begin at the first measurement. The final trajectory begins at the first estimate and may be
-    empty. A log with neither start nor reference, and without a map that its sensors observe, starts at the pose (0, 0, 0).
+    With an unknown start, ticks begin at the first measurement. The final trajectory begins at the first estimate and
+    may be empty. A log starts at (0, 0, 0) if it has no start, no reference, and no map that its sensors observe.
 
-    Raises InputError if the configuration does not fit the log. Raises RunFailedError if the estimator fails, or if a pose or
-    a covariance is invalid; see :mod:`factorgraph_loc.fusion.guarded`.
+    Raises InputError if the configuration does not fit the log. Raises RunFailedError if the estimator fails, or if a
+    pose or a covariance is invalid; see :mod:`factorgraph_loc.fusion.guarded`.
     """
     use = _use(log, config)
     stated = resolve_prior(log, config.prior)
@@ -98,7 +98,7 @@ def run(
 
 
 def _use(log: Log, config: RunConfig) -> Use:
-    """Return the sensors and settings of a run. Raises InputError if values of the log or the configuration are out of bounds."""
+    """Return the sensors and settings of a run. Raises InputError if the log or the configuration is out of bounds."""
     check_max_gap(config.max_gap)
     check_tick_gap(config.tick_gap)
     require_bounds(log)  # no reader has checked a log that was made by a program
@@ -109,7 +109,7 @@ def _use(log: Log, config: RunConfig) -> Use:
 
 
 class _Start(NamedTuple):
-    """The start of a run: its ``prior``, None if the start is unknown, the name of its ``source``, and warnings."""
+    """The start of a run: its ``prior`` (None if the start is unknown), the name of the ``source``, and warnings."""
 
     prior: PosePrior | None
     source: str
@@ -117,7 +117,7 @@ class _Start(NamedTuple):
 
 
 def _start(use: Use, config: RunConfig, estimator: Estimator, prior: PosePrior | None, source: str) -> _Start:
-    """Return the start of a run. ``prior``, ``source``: the requested prior and its source.
+    """Return the start of a run. ``prior``, ``source``: what :func:`resolve_prior` returned.
 
     Raises InputError if the estimator cannot start from an unknown pose or an unknown heading.
     """
@@ -140,7 +140,7 @@ def _start(use: Use, config: RunConfig, estimator: Estimator, prior: PosePrior |
 
 
 def _ended(guard: Guard, estimator: Estimator, frame: MapFrame) -> tuple[Ending, float]:
-    """Return the final results of an estimator, and the computing time [s] of the final trajectory."""
+    """Return the final results of an estimator, and the computing time [s] of its final trajectory."""
     started = perf_counter()
     with guard.computing("the final trajectory"):
         final = frame.trajectory(sound_trajectory(estimator.trajectory()))
@@ -160,7 +160,10 @@ def _result(
     end: Ending,
     final_seconds: float,
 ) -> RunResult:
-    """Collect the result of a run, with its effective configuration and all warnings."""
+    """Return the result of a run, with its effective configuration and all warnings.
+
+    ``causal``: the finished main loop. ``end``: the final results. ``final_seconds``: computing time of the trajectory.
+    """
     log = use.log
     reviews = {name: review(use, end) for name, review in functions("review")}
     reliability = {name: result.reliability for name, result in reviews.items() if result.reliability is not None}
@@ -208,9 +211,9 @@ def _result(
 def _rehearse(
     config: RunConfig, setup: model_setup.Setup, settings: FileModel, log: Log, prior: PosePrior | None
 ) -> None:
-    """Run an estimator on the beginning of a log, so that compiled functions are loaded before computing times are measured.
+    """Run an estimator on the beginning of a log. This loads compiled functions before computing times are measured.
 
-    A process does this once for each estimator and set of sensors. Errors are ignored, because the run itself repeats them.
+    A process does this once for each estimator and set of sensors. Errors are ignored, because the run repeats them.
     """
     kind = config.estimator, setup.sensors
     if kind in _REHEARSED:

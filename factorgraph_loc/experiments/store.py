@@ -47,14 +47,14 @@ class StoredFile(BaseModel):
 
 
 class RunManifest(StoredFile):
-    """The content of ``manifest.json``: the ``key`` of a run, and the sha256 of its ``files`` by name."""
+    """The content of ``manifest.json``: the ``key`` of a run, and {file name: sha256} of its ``files``."""
 
     key: str
     files: dict[FileName, str]
 
 
 class Failure(StoredFile):
-    """The content of ``failure.json``: why a run failed. ``kind``: kind of the failure, such as "timeout"."""
+    """The content of ``failure.json``, which explains why a run failed. ``kind``: such as "timeout"."""
 
     kind: str
     reason: str
@@ -75,7 +75,7 @@ Kind = TypeVar("Kind", bound=StoredFile)
 
 
 def parse_stored(kind: type[Kind], content: bytes, path: Path) -> Kind:
-    """Parse the JSON ``content`` of the file ``path`` as a model of class ``kind``. Raises DamagedError if it is invalid."""
+    """Return the JSON ``content`` of the file ``path`` as a model of class ``kind``. Raises DamagedError if invalid."""
     try:
         return kind.model_validate_json(content)
     except ValidationError as error:
@@ -89,7 +89,10 @@ class StoreError(RunFailedError):
 
 
 class Store:
-    """The store of results in the folder ``folder/store``. Methods raise StoreError if it cannot be written."""
+    """The store of results in the folder ``folder/store``. It has a folder for each run, named by the key of the run.
+
+    Several processes may use it. Methods raise StoreError if the store cannot be written.
+    """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder / "store"
@@ -104,7 +107,7 @@ class Store:
         self.sweep()
 
     def sweep(self) -> None:
-        """Remove the claims and the partial results of processes that died."""
+        """Remove the locks and the partial results of processes that died."""
         with self._writing():
             keys = {path.name for name in ("claims", "tmp") for path in (self.folder / name).iterdir()}
         for key in keys:
@@ -113,11 +116,12 @@ class Store:
                     _remove(self.folder / "tmp" / key)
 
     def path(self, key: str) -> Path:
-        """Return the folder of a run by its key."""
+        """Return the folder with the files of the run ``key``."""
         return self.folder / key[:2] / key
 
     def state(self, key: str) -> State:
-        """Return the state of a run's results: ok, failed, missing or damaged. All files are compared with their checksums."""
+        """Return the state of the results of the run ``key``: ok, failed, missing or damaged. Checksums are
+        compared."""
         try:
             manifest = self._manifest(key)
             for name in manifest.files:
@@ -128,11 +132,11 @@ class Store:
         return "failed" if FAILURE in manifest.files else "ok"
 
     def read(self, key: str, name: str) -> bytes:
-        """Read a file of a run, and compare it with its checksum. Raises DamagedError if it is missing or damaged."""
+        """Return the file ``name`` of the run ``key``. Raises DamagedError if it is missing or has a wrong checksum."""
         return self._read(self._manifest(key), name)
 
     def row(self, key: str) -> dict[str, Any]:
-        """Return the columns of a run for the table of results.
+        """Return the columns of a run for the table of results, as {name: value}.
 
         They are ``status`` (ok, failed), ``kind`` and ``reason`` of a failure, and ``warnings`` (one per line). Scores
         and times that are single numbers are columns too. Raises DamagedError as :meth:`read`.
@@ -154,7 +158,7 @@ class Store:
         return row_of(state | {name: value for name, value in scores.items() if name not in state})
 
     def _read(self, manifest: RunManifest, name: str) -> bytes:
-        """Read a file of a run, and compare it with the checksum in the manifest."""
+        """Return the file ``name`` of a run. Raises DamagedError if its checksum differs from the manifest."""
         path = self.path(manifest.key) / name
         expected = manifest.files.get(name)
         content = self._content(path)
@@ -178,7 +182,7 @@ class Store:
             raise DamagedError(f"{error}{_AGAIN}") from error
 
     def put(self, key: str, files: Mapping[str, bytes]) -> None:
-        """Write the files of a run atomically, and replace existing ones. The caller must hold a claim of the run.
+        """Write the files of a run atomically, and replace existing ones. The caller must lock the run (:meth:`claim`).
 
         ``files``: {file name: content}.
         """
@@ -204,7 +208,7 @@ class Store:
 
     @contextmanager
     def claim(self, key: str) -> Iterator[bool]:
-        """Claim a run in this block against other processes. Yields True, or False if another process has claimed it."""
+        """Lock a run against other processes in this block. Yields True, or False if another process has locked it."""
         path = self.folder / "claims" / key
         with self._writing():
             handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
@@ -241,7 +245,7 @@ def _remove(path: Path) -> None:
 
 
 def _lock(handle: int, path: Path) -> bool:
-    """Lock the open file ``handle`` without waiting. Return False if another process has locked or removed it, else True."""
+    """Lock the open file ``handle`` without waiting. Return False if another process has locked or removed it."""
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
