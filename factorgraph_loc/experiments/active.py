@@ -101,20 +101,19 @@ def active(
     overwrite: bool = False,
     progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> Done:
-    """Simulate robots that drive from an unknown start until they are localized, and compare policies that choose
-    paths.
+    """Simulate robots that drive from an unknown start until they are localized, and compare policies for their paths.
 
     There is a run for each policy, estimator and seed. ``world``: a preset of
     :func:`~factorgraph_loc.api.logs.simulate`, a TOML file, or settings. ``out``: folder for the results.
-    ``overwrite``: whether existing results in ``out`` may be replaced. ``changes``: nested settings of robot, policy or
-    world, such as ``{"policy": {"horizon": 8}}``. ``jobs``: number of processes, None for one per core. ``progress``:
-    called with the number of finished runs and of all runs.
+    ``overwrite``: replace existing results in ``out``. ``changes``: nested settings of robot, policy or world, such as
+    ``{"policy": {"horizon": 8}}``. ``jobs``: number of processes, None for one per core. ``progress``: called with the
+    numbers of finished and of all runs.
 
-    The files in ``out`` are ``results.parquet`` and ``results.csv`` (a row for each run), ``differences.csv`` (see
+    The files in ``out`` are ``results.parquet``, ``results.csv`` (a row for each run), ``differences.csv`` (see
     :func:`~factorgraph_loc.experiments.active_results.differences`), ``table.md``, ``config.toml`` and
     ``plots/comparison.png``. For each policy and estimator there is a plot of the run with the first seed. A failed run
     has a row with the reason. The same call resumes an interrupted experiment. Raises InputError for an unknown or
-    repeated name, for results in ``out`` without ``overwrite``, or if every run fails on its input.
+    repeated name, for results in ``out`` without ``overwrite``, or if every run rejects its input.
     """
     simulation, settings = _settings(world, changes or {})
     seeds, out = list(seeds), Path(out)

@@ -51,7 +51,7 @@ def map_error_warning(log: Log, frame: MapFrame, final: Trajectory) -> tuple[Not
 
 
 def with_pauses(log: Log, skipped: Sequence[tuple[float, float]], tick_gap: float) -> tuple[Notice, ...]:
-    """Return a warning about gaps between measurements, for which there are no estimates.
+    """Return a warning about gaps between measurements. There are no estimates in these gaps.
 
     ``skipped``: begin and end [s] of each gap. ``tick_gap`` [s]: the minimum length of such a gap.
     """

@@ -120,8 +120,8 @@ class Store:
         return self.folder / key[:2] / key
 
     def state(self, key: str) -> State:
-        """Return the state of the results of the run ``key``: ok, failed, missing or damaged. Checksums are
-        compared."""
+        """Return the state of the results of the run ``key``: ok, failed, missing or damaged. It tests all
+        checksums."""
         try:
             manifest = self._manifest(key)
             for name in manifest.files:

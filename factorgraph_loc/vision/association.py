@@ -138,7 +138,7 @@ class Associator:
     def _similar_views(self, points: Integers, place: Array) -> tuple[Integers, Integers]:
         """Return the views of ``points`` (C,) from viewpoints similar to the camera position ``place`` (3,).
 
-        A view is an observation of a map point in an image from which the map was made. The first array (V,) has the
+        A view is an observation of a map point in an image that was used to make the map. The first array (V,) has the
         indices of the selected views, sorted by point. The second array (C + 1,) has the index in the first array where
         the views of each point begin; its last value is V.
         """

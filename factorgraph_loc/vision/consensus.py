@@ -102,7 +102,7 @@ def _best_of_samples(
         rotation = np.repeat(camera.rotation[None], ROUND, axis=0)
         total = np.zeros((ROUND, 6))
         for _ in range(3):
-            # Gauss-Newton in units in which the prior of the perturbation is a unit Gaussian
+            # Gauss-Newton with whitened perturbations: their prior is a unit Gaussian
             residual, jacobian = _whitened(model, position, rotation, points[rows], pixels[rows], whiteners[rows])
             flat = jacobian @ root
             normal = flat.transpose(0, 2, 1) @ flat

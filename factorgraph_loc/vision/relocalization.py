@@ -175,7 +175,7 @@ def found_on_floor(
 class KeyframeIndex:
     """An index of the keyframes of a map, to find the keyframes that are most similar to an image.
 
-    A keyframe is an image from which the map was made. ``descriptors`` (M, D): of all M features in these images.
+    A keyframe is an image that was used to make the map. ``descriptors`` (M, D): of all M features in these images.
     ``seen_from`` (M, 3): the camera position of each feature's image. Equal camera positions mean the same keyframe.
     """
 
