@@ -99,9 +99,8 @@ class NewVariable:
     """A new block of the state: the position of a landmark that is seen for the first time, or a variable with a prior.
 
     ``mean`` (d,): the initial estimate. ``by_pose`` (d, 3): its Jacobian by the body-frame perturbation of the pose.
-    ``by_block``: its Jacobians (d, P) by other blocks. ``noise`` (d, d): its covariance if the pose and the other
-    blocks were exact. ``sightings``: times [s] and observations that give ``mean``. If empty, ``mean`` and ``noise``
-    are a prior.
+    ``by_block``: its Jacobians (d, P) by other blocks. ``noise`` (d, d): its covariance if the pose and these blocks
+    were exact. ``sightings``: times [s] and observations that give ``mean``. If empty, mean and noise are a prior.
     """
 
     name: str
@@ -303,12 +302,11 @@ class Sensor:
 
     def at_end(self, factor: Factor, width: float) -> Factor | None:
         """Return the factor that replaces ``factor`` when the whole graph is solved after a run, or None to omit it.
-        ``width``: factor on the scale of the robust loss. It exceeds 1 in the first steps of graduated
-        non-convexity."""
+        ``width``: factor on the scale of the robust loss, above 1 in the first steps of graduated non-convexity."""
         return factor
 
     def convex_width(self, factor: Factor, values: Sequence[Array]) -> float:
-        """Return the smallest ``width`` of :meth:`at_end` that makes the loss of ``factor`` convex at its variables
+        """Return the smallest ``width`` of :meth:`at_end` that makes the loss of ``factor`` convex at the variables
         ``values``."""
         return 1.0
 

@@ -74,8 +74,7 @@ class Ending:
 
 @dataclass(frozen=True)
 class Review:
-    """A sensor's assessment of a finished run: ``warnings``, and the ``reliability`` of the sensor's model
-    (None: unknown)."""
+    """A sensor's assessment of a finished run: ``warnings``, and the ``reliability`` of its model (None if unknown)."""
 
     warnings: tuple[Notice, ...] = ()
     reliability: Reliability | None = None
@@ -204,8 +203,8 @@ class Ride:
 class Simulated:
     """The simulated measurements of a sensor.
 
-    ``streams``: the streams of measurements by channel. ``layers``: map layers with survey errors, by name, if they
-    differ from the true world. ``metadata``: entries for the metadata of the log.
+    ``streams``: the streams of measurements by channel. ``layers``: the map layers that differ from the true world
+    because of survey errors, by name. ``metadata``: entries for the metadata of the log.
     """
 
     streams: Mapping[str, Stream] = field(default_factory=dict)

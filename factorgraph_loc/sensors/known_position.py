@@ -58,8 +58,7 @@ class KnownPosition:
         return Mode(1.0, np.append(self.prior.pose[:2], turned), covariance)
 
     def candidates(self, now: ChainState) -> Array:
-        """Return possible poses (N, 3) at the odometry state ``now``: N evenly spaced start headings, moved by the
-        odometry."""
+        """Return possible poses (N, 3) at the odometry state ``now``, from N evenly spaced headings at the start."""
         headings = np.arange(HEADINGS) * 2.0 * math.pi / HEADINGS
         starts = np.column_stack((np.tile(self.prior.pose[:2], (HEADINGS, 1)), headings))
         return se2.compose(starts, self.motion.relative(self.odometry, now).delta)

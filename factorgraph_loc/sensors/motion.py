@@ -138,8 +138,7 @@ class Motion(OdometryChain):
         return np.asarray(se2.exp(moved))
 
     def slip(self, increment: Increment) -> tuple[Array, float]:
-        """Return the covariance (3, 3) to add to an increment with wheel slip, and the negative log-probability of
-        slip."""
+        """Return the covariance (3, 3) to add to an increment with slip, and the negative log-probability of slip."""
         return slip(self.model, increment, use_gyro=self._use_gyro)
 
 

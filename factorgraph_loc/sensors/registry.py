@@ -105,8 +105,7 @@ def sensors() -> Mapping[str, SensorType]:
 
 
 def sensor(name: str) -> SensorType:
-    """Return the type of the sensor ``name``, or of the sensor with the channel ``name``. Raises InputError for other
-    names."""
+    """Return the type of the sensor ``name``, or of the sensor with a channel ``name``. Raises InputError otherwise."""
     if name in sensors():
         return sensors()[name]
     if name in channels():
@@ -144,8 +143,8 @@ def sensor_of(channel: str) -> SensorType:
 
 
 def moving(names: Iterable[str], rank: int = 0) -> tuple[str, ...]:
-    """Return those of the channels ``names`` that measure the motion of the robot. ``rank``: use
-    :data:`~factorgraph_loc.model.measurement.TURN` to include channels that measure only rotation."""
+    """Return those of the channels ``names`` that measure the motion of the robot. ``rank``: 0 for motion in the plane.
+    Use :data:`~factorgraph_loc.model.measurement.TURN` to include channels that measure only rotation."""
     streams = {name: channels()[kind_of(name)].streams for name in names if kind_of(name) in channels()}
     return tuple(name for name, kinds in streams.items() if kinds and kinds[0].rank <= rank)
 
@@ -157,7 +156,8 @@ def parent_of(channel: str) -> str:
 
 
 def detecting(world: Any, names: Collection[str]) -> list[SensorType]:
-    """Return the sensors that can localize the robot in the map ``world`` with the channels ``names``."""
+    """Return the types of sensors that can localize the robot in the map ``world``. ``names``: the available
+    channels."""
     return [
         sensor
         for sensor in sensors().values()

@@ -51,8 +51,7 @@ def _exteroceptive(log: Log) -> bytes:
 
 @dataclass(frozen=True)
 class Corrections:
-    """Corrections ``each`` (N,) of a constant in N logs, their ``mean``, and their standard deviation ``scatter`` over
-    logs."""
+    """Corrections ``each`` (N,) of a constant in N logs, their ``mean``, and their standard deviation ``scatter``."""
 
     each: Array
     mean: float
@@ -68,7 +67,7 @@ def pooled(corrections: Sequence[tuple[float, float]], known: float) -> Correcti
     """Return the mean of corrections of a constant over N logs, and the scatter between logs without estimation errors.
 
     ``corrections``: N pairs of a correction and its standard deviation. ``known``: the standard deviation in the input
-    rig. The scatter is averaged with it. It has the weight of :data:`WORTH` logs.
+    rig. The scatter is averaged with ``known``, which has the weight of :data:`WORTH` logs.
     """
     each, errors = np.array(corrections).T
     beyond = float(np.sum((each - each.mean()) ** 2) - (len(each) - 1) * np.mean(errors**2))

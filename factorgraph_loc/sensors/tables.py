@@ -36,9 +36,9 @@ Columns = Mapping[str, Array | Integers | Sequence[str]]
 
 @dataclass(frozen=True)
 class Reading:
-    """Arguments of ``Channel.assemble``. ``rig``: the robot. ``t0_ns``: the absolute time of t = 0 [ns]. ``warnings``:
-    a list to append warnings to. ``shared``: values that several sensors use, by name, such as the origin of latitudes.
-    """
+    """Arguments of ``Channel.assemble``. ``rig``: the robot and its sensors. ``t0_ns``: the absolute time of t = 0
+    [ns]. ``warnings``: a list to append warnings to. ``shared``: values by name that sensors share, such as a map
+    origin."""
 
     rig: Rig
     t0_ns: int
@@ -58,8 +58,8 @@ class Writing:
 
 @cache
 def tables_of(channel: Channel) -> tuple[Table, ...]:
-    """Return the descriptions of a channel's files in a log. Descriptions with the same name are alternative
-    formats."""
+    """Return the descriptions of a channel's files. Descriptions with the same name are alternative formats of a
+    file."""
     return tuple(load(place) for place in channel.tables)
 
 
@@ -143,7 +143,7 @@ def stream_of(table: Table, rows: TableRows, t0_ns: int, warnings: list[Notice])
 
 
 def _all_empty(columns: Sequence[Array]) -> NDArray[np.bool_]:
-    """Return a mask (N,) that is True for rows in which all ``columns`` (each (N,)) are NaN."""
+    """Return a mask (N,) that is True for rows with NaN in all ``columns`` (each (N,))."""
     return np.asarray(np.isnan(columns).all(axis=0))
 
 
@@ -161,7 +161,7 @@ def _without_small(column: Column, rows: TableRows, warnings: list[Notice]) -> A
 
 
 def disassemble(channel: Channel, stream: Stream, writing: Writing) -> dict[str, Columns]:
-    """Return the columns of the files in which a stream is stored, by table name. Images of the stream are copied into
+    """Return the columns of the files that store ``stream``, by table name. Images of the stream are copied into
     ``writing.folder``. Raises InputError if the native format has no table for the stream."""
     if channel.disassemble:
         made: dict[str, Columns] = load(channel.disassemble)(stream, writing)
@@ -174,7 +174,8 @@ def disassemble(channel: Channel, stream: Stream, writing: Writing) -> dict[str,
 
 
 def columns_of(channel: Channel, stream: Stream) -> Iterator[Column]:
-    """Yield the description of each numeric field of ``stream``. Its ``name`` is the name of the field."""
+    """Yield the description of each numeric field of ``stream``. The attribute ``name`` of a description is the name of
+    the field."""
     for table in (*tables_of(channel), *(load(place) for place in channel.described)):
         if table.stream and load(table.stream) is type(stream):
             measured = [column.measured for column in table.columns if column.kind == "number"]
@@ -189,8 +190,7 @@ class Intake:
     measurements without changes."""
 
     def measured(self, m: Measurement) -> Measurement:
-        """Return ``m`` in the form that estimators need, such as the features of an image. This method is
-        thread-safe."""
+        """Return ``m`` in the form that estimators need, such as the features of an image. Thread-safe."""
         return m
 
     def require(self, m: Measurement) -> None:
@@ -212,8 +212,8 @@ def channel_of(kind: type[Any]) -> Channel:
 
 
 def checked(m: M) -> M:
-    """Validate a measurement. Returns ``m`` if all fields are valid floats, otherwise a copy with validated fields.
-    Raises InputError with the name and value of the first invalid field."""
+    """Return ``m`` if all its fields are valid floats, otherwise a copy of ``m`` with validated fields. Raises
+    InputError with the name and value of the first invalid field."""
     if (floats := _floats_of(type(m))) is not None:
         for name, low, high in floats:
             value = getattr(m, name)

@@ -34,7 +34,7 @@ from factorgraph_loc.vision.keypoints import Integers
 from factorgraph_loc.vision.tracks import FeatureTracker
 from factors.camera.model import CameraModel
 
-# source files of factorgraph_loc.vision on which cached features depend; cached tracks also depend on TRACK_CODE
+# source files of factorgraph_loc.vision that compute cached features; cached tracks also depend on TRACK_CODE
 FEATURE_CODE = (
     "colour_features.py",
     "descriptor.py",
@@ -105,8 +105,8 @@ def _features(
     kept: FeatureCache,
     progress: Callable[[float], None],
 ) -> list[_ImageFile]:
-    """Return the features of the image ``files``, from the cache ``kept`` if possible. ``size``: width and height of
-    the camera's images [px]."""
+    """Return the image ``files`` with their features, from the cache ``kept`` if possible. ``size``: width and height
+    of the camera's images [px]. ``progress`` is called with the completed fraction."""
     about = f"{settings.model_dump_json()} {size} {code_version(FEATURE_CODE)} "
     new: dict[str, _ImageFile] = {}
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # reading, hashing and detection release the interpreter lock
@@ -123,8 +123,8 @@ def _features(
 
 
 def _from_cache(file: Path, about: str, kept: FeatureCache) -> _ImageFile:
-    """Return the features of an image from the cache ``kept``, or None as features if it lacks them. Also sets the
-    cache key, a hash of the bytes of ``file`` and of the text ``about``."""
+    """Return an image file with its features from the cache ``kept``, or with the features None if the cache lacks
+    them. The cache key is a hash of the bytes of ``file`` and of the text ``about``."""
     try:
         content = read_bytes(file, IMAGE)
     except InputError as error:

@@ -61,8 +61,8 @@ class KnownPoints:
     """Converts camera measurements to factors of points in the map. The diagnostics count points that are not in the
     map as ignored, and outliers as rejected.
 
-    ``estimated``: the camera's constants that are estimated. ``use``: "unknown" to ignore the map, "extended" if points
-    that are not in the map are estimated elsewhere, otherwise "known". ``name``: the name of the sensor.
+    ``estimated``: the camera's constants that are estimated. ``use``: "known" to use the points of the map, "extended"
+    if the estimator also estimates other points, "unknown" to ignore the map. ``name``: the name of the sensor.
     """
 
     def __init__(
@@ -181,8 +181,8 @@ class KnownPoints:
         return levelled
 
     def find(self, m: Pixels) -> tuple[FoundOnFloor | None, int]:
-        """Return the robot's pose at an image, computed without a prediction, or None if no pose fits. Also return the
-        number of points of the map that are expected in the image."""
+        """Return the robot's pose at the image ``m``, computed without a prediction, or None if no pose fits. Also
+        return the number of points of the map that are expected in the image."""
         model = self.model
         if not len(self.map):
             return None, 0

@@ -165,7 +165,8 @@ def make_images(table: TableRows, t0_ns: int, warnings: list[Notice], folder: Pa
 
 
 def assemble(rows: Mapping[str, TableRows], reading: Reading) -> ImageStream:
-    """Return the images of a log in the native format as a stream. ``rows``: the rows by table name."""
+    """Return the images of a log in the native format as a stream. ``rows``: the rows by table name. ``reading``: the
+    time origin, and a list to append warnings to."""
     return make_images(rows["camera"], reading.t0_ns, reading.warnings)
 
 

@@ -42,8 +42,8 @@ class PixelObservation(ResidualObservation):
     """The observation of points in one image.
 
     ``seen``: the factor of the points. It may also depend on constants of the camera and on displacements of points.
-    ``expected`` (3,): the predicted robot pose at which the points were identified. ``held``: the values (P,) and the
-    covariance (P, P) of the camera's constants if :meth:`on_pose` has fixed them, otherwise None.
+    ``expected`` (3,): the predicted robot pose at which the points were identified. ``held``: None, or the values (P,)
+    and the covariance (P, P) of the camera's constants if :meth:`on_pose` treats them as noise.
     """
 
     iterations: ClassVar[int] = ITERATIONS
@@ -199,7 +199,8 @@ def displaced_by(factor: ReprojectionFactor, which: list[int]) -> ReprojectionFa
 
 
 def bind(binding: Binding) -> CameraSensor | None:
-    """Return the camera sensor of a run, or None if the run does not use it."""
+    """Return the camera sensor of a run, or None if the run does not use it. ``binding``: the arguments of the
+    sensor."""
     setup = binding.setup
     if setup.rig.find(CameraSettings) is None or not any(sensor in setup.sensors for sensor in CAMERAS):
         return None
@@ -240,12 +241,13 @@ class PixelFinder:
 
     @property
     def newest(self) -> ChainState | None:
-        """The odometry state at the last image with a computed pose, or None."""
+        """The odometry state at the last image that determined a pose, or None."""
         return self._fixes[-1].odometry if self._fixes else None
 
     @property
     def hypotheses(self) -> tuple[Mode, ...]:
-        """The pose from the last image with a computed pose as the only hypothesis, or () if there is no such image."""
+        """A tuple with one hypothesis, the pose from the last image that determined a pose. () if there is no such
+        image."""
         if not self._fixes:
             return ()
         last = self._fixes[-1]
@@ -292,8 +294,8 @@ class PixelFinder:
         return since if self._agree() else None
 
     def look(self, m: Pixels, odometry: ChainState) -> bool:
-        """Compute the robot's pose from the image ``m``. ``odometry``: the odometry state at the image. Returns False
-        without a pose."""
+        """Compute the robot's pose from ``m``. ``odometry``: the odometry state at the image. Returns False if no pose
+        fits."""
         if not self._fixes and m.t < self._fruitless + SEARCH_INTERVAL and m.t >= self._fruitless:
             return False
         self._fixes = [f for f in self._fixes if m.t - KEPT <= f.odometry.t < m.t]
@@ -310,8 +312,8 @@ class PixelFinder:
         return True
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
-        """Return ``count`` random poses (N, 3), drawn from the Gaussian of the pose from the last image. At least one
-        successful :meth:`look` is required."""
+        """Return ``count`` random poses (N, 3), drawn from the Gaussian of the pose from the last image. Requires that
+        a pose has been computed."""
         last = self._fixes[-1]
         body = last.covariance + LEAST
         return np.asarray(se2.compose(last.pose, se2.exp(rng.multivariate_normal(np.zeros(3), body, count))))

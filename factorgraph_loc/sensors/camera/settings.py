@@ -43,7 +43,8 @@ class FrontendSettings(FileModel):
 
 
 class CameraUncertainty(FileModel):
-    """Standard deviations of the camera's calibration constants before a run. Constants above 0 are estimated."""
+    """Standard deviations of calibration constants of the camera before a run. Constants with values above 0 are
+    estimated."""
 
     x: Distance = 0.0
     """standard deviation of the camera's x"""

@@ -134,8 +134,8 @@ def _without_features(log: Log, stream: ImageStream, estimator: str) -> Prepared
 
 
 class CameraIntake(Intake):
-    """Detects features in images for the live localizer. Also checks that all descriptors have the same length as those
-    in the map, or as the first ones if the map has none."""
+    """Detects features in images for the live localizer. Raises InputError if the length of descriptors differs from
+    those in the map, or from the first ones if the map has none."""
 
     def __init__(self, rig: Rig, world: World) -> None:
         points = world.points

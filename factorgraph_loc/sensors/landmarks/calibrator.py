@@ -112,10 +112,10 @@ def separated(errors: Array, ranges: Array) -> tuple[tuple[float, float], Array]
 
 
 def _scatter(errors: Array, ranges: Array, weights: Array, start: tuple[float, float]) -> tuple[float, float]:
-    """Return (constant, relative) of :func:`separated` for ``errors`` (K,) with ``weights`` (K,).
+    """Return the standard deviation of ``errors`` (K,) with ``weights`` (K,) as the pair (constant, relative).
 
-    This is one step of Fisher scoring from ``start``, the values of the previous step (Nelder and Pregibon, "An
-    extended quasi-likelihood function", Biometrika 74(2), 1987).
+    See :func:`separated`. This is one step of Fisher scoring from ``start``, the values of the previous step (Nelder
+    and Pregibon, "An extended quasi-likelihood function", Biometrika 74(2), 1987).
     """
     design = np.column_stack((np.ones(len(errors)), ranges**2))
     root = np.sqrt(weights) / (design @ np.square(start))
@@ -153,8 +153,9 @@ class LandmarkCalibrator(ConstantsCalibrator):
         return Sightings(log, stream.t[rows], points, stream.range[rows], bearings[rows], np.ones((len(rows), 2)))
 
     def parameters(self, parts: Sequence[Sightings], settings: BearingRangeSettings) -> list[Parameter]:
-        """Return the constants to estimate, each with a prior around its value in ``settings``. If the reference has no
-        headings, the position on the robot and the time offset are not estimated."""
+        """Return the constants to estimate, each with a prior around its value in ``settings``. ``parts``: the
+        sightings of each log. If the reference has no headings, the position on the robot and the time offset are not
+        estimated."""
         has_range = any(np.isfinite(part.ranges).any() for part in parts)
         has_bearing = any(np.isfinite(part.bearings).any() for part in parts)
         has_heading = all(part.log.reference is not None and part.log.reference.has_heading for part in parts)
@@ -171,8 +172,8 @@ class LandmarkCalibrator(ConstantsCalibrator):
     def with_noise(
         self, parts: Sequence[Sightings], settings: BearingRangeSettings
     ) -> tuple[Sequence[Sightings], BearingRangeSettings]:
-        """Return the sightings with new inlier probabilities ``sound``, and the settings with new noise. The noise is
-        estimated without gross errors."""
+        """Return ``parts``, the sightings of each log, with new inlier probabilities ``sound``, and the settings with
+        new noise. The noise is estimated without gross errors."""
         errors = np.concatenate([part.errors(settings) for part in parts])
         ranges = np.nan_to_num(np.concatenate([part.ranges for part in parts]))
         sigmas, sound = dict[str, float](), np.ones(errors.shape)

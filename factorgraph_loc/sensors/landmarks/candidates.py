@@ -25,10 +25,10 @@ from factors.robust import geman_mcclure_loss, geman_mcclure_weight
 from factors.se2 import Array, Integers
 
 MOST = 1000  # maximum number of stored sightings of a landmark
-USED = 80  # maximum number of sightings from which a position is computed, evenly selected
+USED = 80  # maximum number of sightings for the computation of a position, evenly selected
 DRIFT = 0.2  # rad; sightings are too old if the standard deviation of the rotation since then exceeds this
 APART = 0.1  # m; minimum motion of the robot between stored sightings
-FEWEST, GROWTH = 8, 1.25  # number of sightings for the first attempt; factor by which each attempt needs more
+FEWEST, GROWTH = 8, 1.25  # number of sightings for the first attempt; growth of this number after each attempt
 DIRECTIONS = 24  # number of initial positions on a circle around the robot
 RADII = (1.0, 3.0, 10.0, 30.0)  # m; radii of the initial positions if there is no range
 ITERATIONS, REFINEMENTS = 20, 8  # maximum number of iterations with independent, and with correlated odometry errors

@@ -87,7 +87,8 @@ class BearingRangeStream(ScanStream):
 
 
 class BearingRangeUncertainty(FileModel):
-    """Standard deviations of the sensor's calibration constants before a run. Constants above 0 are estimated."""
+    """Standard deviations of calibration constants of the sensor before a run. Constants with values above 0 are
+    estimated."""
 
     x: Annotated[float, Field(ge=0.0, le=10.0), InUnit("m")] = 0.0
     """standard deviation of the sensor's x"""

@@ -51,7 +51,7 @@ def together(factors: Sequence[BearingRangeFactor]) -> BearingRangeFactor:
 SURVEYED_ITERATIONS = 4  # number of linearisations if the position of a surveyed landmark is estimated
 WORK = 8  # time to compute the likelihood of one landmark at one pose, relative to the time for an RFID tag
 SMALL = 40  # maximum size of an error state that compiled code corrects
-MAX_PENDING = 5  # maximum number of stored sightings of a new landmark, of which two must agree
+MAX_PENDING = 5  # maximum number of stored sightings of a new landmark; two of them must agree
 
 
 @dataclass(frozen=True)
@@ -71,7 +71,7 @@ class LandmarkObservation(ResidualObservation):
 
     @property
     def measured(self) -> BearingRangeFactor:
-        """The factors of all terms, merged into one factor."""
+        """One factor with all landmarks of the observation."""
         return together([cast(BearingRangeFactor, term.factor) for term in self.terms])
 
     def correct(
@@ -265,8 +265,7 @@ class LandmarkSensor(Sensor):
             yield NewVariable(block, np.zeros(1), np.zeros((1, 3)), {}, np.array([[self._bias**2]]), ())
 
     def _term(self, name: str, factor: BearingRangeFactor, view: View) -> Term:
-        """Return the graph term of the landmark ``name``. It depends on the landmark's range bias if the state has
-        one."""
+        """Return the graph term of the landmark ``name``. It depends on a range bias if the state contains the bias."""
         block = f"{self.modality}/{name}"
         if factor.biased and view.value(f"{block}/bias") is None:
             factor = replace(factor, biased=False)
@@ -368,7 +367,7 @@ def _rotation(heading: float) -> Array:
 
 
 def bind(binding: Binding) -> LandmarkSensor | None:
-    """Return the landmark sensor of a run, or None if the run does not use it."""
+    """Return the landmark sensor of a run, or None if the run does not use it. ``binding``: arguments of the sensor."""
     settings = binding.setup.rig.find(BearingRangeSettings)
     if settings is None or LandmarkSensor.modality not in binding.setup.sensors:
         return None

@@ -20,11 +20,11 @@ from factors.motion import ChainState
 from factors.robust import geman_mcclure_loss, geman_mcclure_weight
 from factors.se2 import Array, Integers
 
-RECENT = 6  # maximum number of landmarks from which candidates are computed
+RECENT = 6  # maximum number of landmarks that give candidates
 CIRCLE = 72  # number of candidate headings for the sighting of one landmark
 HEADINGS = 24  # number of candidate bearings if the bearing is not measured
 RADII = (0.7, 1.5, 3.0, 6.0)  # m; candidate ranges if the range is not measured
-BASELINE = 0.3  # m; minimum distance of two landmarks from which a heading is computed
+BASELINE = 0.3  # m; minimum distance of two landmarks that give a heading
 CONVERGED = 1e-4  # m, rad; the refinement of a candidate ends if a step is smaller
 FLAT = np.diag((1e-4, 1e-4, 1e-1))  # information of the nearly flat prior: 1/m^2, 1/m^2, 1/rad^2
 
@@ -43,7 +43,7 @@ class Sighting(NamedTuple):
 
 
 class SightingWindow:
-    """The likelihood of the robot's pose at the last of K sightings ("present pose"), and candidates for this pose.
+    """The likelihood of the robot's pose at the last of K sightings, and candidates for this pose.
 
     ``rows``: the sightings in order of time. ``start``: the start of the run if its position is known, otherwise None.
     ``now``: the odometry state at the last sighting. ``points`` (K, 2): positions of the landmarks in the map.
@@ -145,7 +145,7 @@ class SightingWindow:
     def losses(self, poses: Array, whitener: Array, noise: Array | None = None) -> Array:
         """Return the losses (N,) of ``poses`` (N, 3) at the last sighting: the sum of robust losses of the sightings,
         plus the loss of a known start. ``whitener``: the result of :meth:`whitener`. ``noise`` (3, 3): body-frame
-        covariance of the poses. Only the loss of the start depends on it."""
+        covariance of the poses. Only the loss of the start depends on ``noise``."""
         loss: Array = geman_mcclure_loss(self.squared(poses, whitener), self._model.robust).sum(axis=1)
         return loss if self._start is None else loss + self._start.loss(poses, self.now, noise)
 

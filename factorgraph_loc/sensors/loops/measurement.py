@@ -126,8 +126,9 @@ POSE = ("x", "y", "heading")
 
 
 def assemble(rows: Mapping[str, TableRows], reading: Reading) -> Stream:
-    """Return the loop closures of a log as a stream. ``rows``: the rows by table name. Raises InputError if a relative
-    pose is incomplete, or if the earlier pose of a loop is not earlier than the loop."""
+    """Return the loop closures of a log as a stream. ``rows``: the rows by table name. ``reading``: the time origin,
+    and a list to append warnings to. Raises InputError if a relative pose is incomplete, or if the earlier pose of a
+    loop closure is not earlier."""
     (table,) = rows.values()
     columns = dict(table.numbers)
     if "before_ns" in columns:

@@ -61,7 +61,7 @@ class LoopSensor(Sensor):
 
 
 def bind(binding: Binding) -> LoopSensor | None:
-    """Return the loop sensor of a run, or None if the run does not use it."""
+    """Return the loop sensor of a run, or None if the run does not use it. ``binding``: the arguments of the sensor."""
     if LoopSensor.modality not in binding.setup.sensors:
         return None
     return LoopSensor(binding, binding.setup.rig.find(LoopSettings) or LoopSettings())

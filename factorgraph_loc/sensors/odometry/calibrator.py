@@ -45,7 +45,7 @@ REFERENCE_SIGMAS = np.array((0.005, 0.005, 0.003))
 MOVING = np.array((0.05, 0.1))  # m/s, rad/s; the robot moves in a window if it is faster than one of these
 MIN_WINDOWS = 15
 LENGTHS = (1.0, 3.0, 10.0)  # s; lengths of the windows for the estimation of noise
-BLACKOUT = 30.0  # s; length of the windows to which the size of the noise is adapted
+BLACKOUT = 30.0  # s; length of the windows that determine the overall size of the noise
 MIN_BLACKOUTS = 10
 MOST_OUTLIERS = 0.05  # fraction of the windows; more outliers cause a warning
 ERRORS = {"along": "m", "lateral": "m", "heading": "rad"}
@@ -74,7 +74,7 @@ class Windows:
         return self.begin
 
     def states(self, model: OdometryModel) -> tuple[Array, Array]:
-        """Return the odometry states (M, 8) at the begin and (M, 8) at the end of each window. The columns are those of
+        """Return the odometry states (M, 8) at the start and (M, 8) at the end of each window. The columns are those of
         :class:`factors.motion.ChainState`."""
         chain = integrated(self.log, model)
         return chain.states(self.begin), chain.states(self.end)
@@ -101,8 +101,8 @@ class Windows:
 
 
 def cut(log: Log, length: float) -> Windows:
-    """Return the consecutive windows of ``length`` [s] of a log. Windows are omitted if the odometry has a gap or if
-    the reference has no pose at the first or last time."""
+    """Return the consecutive windows of ``length`` [s] of a log. Windows with a gap of the odometry are omitted, and
+    windows without a reference pose at the start or the end."""
     assert log.reference is not None
     first, last = overlap(log)
     edges = np.arange(first + LEAD, last, length)
@@ -120,7 +120,7 @@ class NoiseFit:
     """The estimated noise of the odometry.
 
     ``growth``: the noise of each error, by name ("along", "lateral", "heading"). ``outliers``: the fraction of windows
-    that are outliers. ``widened``: the factor by which ``growth`` was enlarged to explain errors in long windows.
+    that are outliers. ``widened``: ``growth`` was multiplied by this factor to explain errors in long windows.
     ``floored``: names of the errors with noise that was raised to its lower bound.
     """
 
@@ -228,14 +228,15 @@ class OdometryCalibrator(ConstantsCalibrator):
     def learn(
         self, traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path | None, like: SensorKnowledge | None = None
     ) -> SensorKnowledge:
-        """Return the constants and noise, see :meth:`Calibrator.learn`. The result is empty if the reference has no
+        """Return constants and noise, see :meth:`Calibrator.learn`. The result is empty if the reference has no
         headings."""
         reference = traced[0].log.reference
         has_heading = reference is not None and reference.has_heading
         return super().learn(traced, rig, first, grids, like) if has_heading else SensorKnowledge()
 
     def part(self, log: Log) -> Windows:
-        """Return the windows of a log. Raises InputError if the log has fewer than :data:`MIN_WINDOWS`."""
+        """Return the windows of a log, each WINDOW [s] long. Raises InputError if the log has fewer than
+        MIN_WINDOWS."""
         windows = cut(log, WINDOW)
         if len(windows.begin) < MIN_WINDOWS:
             raise InputError(

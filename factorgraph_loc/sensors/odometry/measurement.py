@@ -57,7 +57,7 @@ class IncrementOdometry:
     """Motion of the robot since the previous measurement.
 
     ``dx``, ``dy`` [m], ``dtheta`` [rad]: the motion in the robot frame of the previous measurement. ``unknown`` [s]:
-    the part of the time since the previous measurement in which the motion was not measured.
+    time without measured motion since the previous measurement.
     """
 
     sensor: ClassVar[str] = "odometry"
@@ -200,7 +200,8 @@ def since_skipped(t_ns: Integers, resumed: NDArray[np.bool_]) -> Array:
 
 
 def disassemble(stream: Stream, writing: Writing) -> dict[str, Columns]:
-    """Return the columns of the table "odometry" by name. The column ``unknown`` is omitted if all its values are 0."""
+    """Return the columns of the table "odometry" by name. The column ``unknown`` is omitted if all its values are 0.
+    ``writing``: the time origin."""
     fields = {name: values for name, values in columns_of(stream).items() if name not in ("t", "unknown")}
     if isinstance(stream, IncrementStream) and stream.unknown.any():
         fields["unknown"] = stream.unknown
@@ -209,7 +210,8 @@ def disassemble(stream: Stream, writing: Writing) -> dict[str, Columns]:
 
 def assemble(rows: Mapping[str, TableRows], reading: Reading) -> Stream:
     """Return the rows of the table "odometry" as a stream of velocities or increments. If timestamps are equal,
-    increments are composed, and the last velocity is kept. ``rows``: the rows by table name."""
+    increments are composed, and the last velocity is kept. ``rows``: the rows by table name. ``reading``: the time
+    origin, and a list to append warnings to."""
     table = rows["odometry"]
     if "dx" not in table.numbers:
         return stream_of(VELOCITIES, table, reading.t0_ns, reading.warnings)

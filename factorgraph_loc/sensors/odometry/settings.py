@@ -35,7 +35,8 @@ class OdometryNoise(FileModel):
 
 
 class OdometryUncertainty(FileModel):
-    """Standard deviations of the odometry's calibration constants before a run. Constants above 0 are estimated."""
+    """Standard deviations of the odometry's calibration constants before a run. Constants with values above 0 are
+    estimated."""
 
     scale_distance: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
     """relative standard deviation of the scale of distances"""

@@ -86,7 +86,8 @@ def against_reference(log: Log) -> tuple[dict[str, float], list[Notice]]:
 
 
 def _ratio(theirs: Array, ours: Array) -> float | None:
-    """Return the least-squares ratio of ``theirs`` (N,) to ``ours`` (N,), or None if ``ours`` are too small."""
+    """Return the least-squares ratio of ``theirs`` (N,) to ``ours`` (N,), or None if the squares of ``ours`` sum up to
+    1 or less."""
     known = np.isfinite(theirs)
     moved = float(ours[known] @ ours[known])
     return float(ours[known] @ theirs[known]) / moved if moved > 1.0 else None

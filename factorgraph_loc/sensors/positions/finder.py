@@ -26,7 +26,7 @@ from factors.se2 import Array
 from factors.update import GATE
 
 DURATION, INTERVAL = 60.0, 0.5  # s; age of the oldest position that is used, and minimum time between positions
-FEWEST, SHARE = 5, 0.8  # a pose needs at least FEWEST positions, of which the fraction SHARE are inliers
+FEWEST, SHARE = 5, 0.8  # a pose needs at least FEWEST positions, and at least the fraction SHARE of inliers
 HEADING = 0.15  # rad; largest standard deviation of a known heading
 WIDENINGS = (64.0, 16.0, 4.0, 1.0, 1.0, 1.0)  # multiplies the scale of the robust loss in each iteration
 BEYOND = 2.0  # a position contradicts the estimated pose if its squared innovation exceeds BEYOND * GATE
@@ -61,8 +61,7 @@ class PositionFinder:
 
     @property
     def suspicious_since(self) -> float | None:
-        """The time [s] since which all positions contradict the estimated pose. None if this time is too short or
-        zero."""
+        """The time [s] since which all positions contradict the estimated pose, or None if this time is too short."""
         if not self._beyond or not all(beyond for _, beyond in self._beyond):
             return None
         first, last = self._beyond[0][0], self._beyond[-1][0]
@@ -98,7 +97,7 @@ class PositionFinder:
         return since if positive.squared(error, world) > BEYOND * GATE else None
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
-        """Return ``count`` random poses (N, 3) at the last position, or (0, 3) before the first. An unknown heading is
+        """Return ``count`` random poses (N, 3) at the last position, or (0, 3) without one. An unknown heading is
         uniform."""
         if not self.hypotheses:
             return np.empty((0, 3))

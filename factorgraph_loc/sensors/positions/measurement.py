@@ -135,7 +135,7 @@ def assemble(rows: Mapping[str, TableRows], reading: Reading) -> Stream:
     """Return the positions of a log as a stream. ``rows``: the rows by table name. Missing covariances are NaN.
 
     Latitudes and longitudes become metres to the east and north of the first position. This origin is the same for all
-    sensors of a log.
+    sensors of a log. ``reading``: the time origin, a list to append warnings to, and values that sensors share.
     """
     (table,) = rows.values()
     if "latitude" in table.numbers:

@@ -60,7 +60,8 @@ class PositionSensor(Sensor):
         yield self.observation(m, view.offset)
 
     def judge(self, observation: PositionObservation, correction: Correction, view: View) -> bool:
-        """Return True, because no position is rejected. Record innovation and residuals [m] in the diagnostics."""
+        """Return True, because no position is rejected. Record innovation and residuals [m] in the diagnostics.
+        ``correction``: the result of ``observation.correct``. ``view``: the estimate before the correction."""
         self._diagnostics.innovation(self.name, observation.t, correction.nis, correction.dof)
         (error,) = -observation.factor.errors(view.pose[None])
         self._diagnostics.add_residuals(f"{self.name}.x", [float(error[0])])
@@ -86,7 +87,8 @@ class PositionSensor(Sensor):
 
 
 def bind(binding: Binding) -> PositionSensor | None:
-    """Return the position sensor of a run, or None if the run does not use it."""
+    """Return the position sensor of a run, or None if the run does not use it. ``binding``: the arguments of the
+    sensor."""
     settings = binding.setup.rig.find(PositionSettings)
     if settings is None or PositionSensor.modality not in binding.setup.sensors:
         return None

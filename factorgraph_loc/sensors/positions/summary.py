@@ -14,7 +14,7 @@ from factors.se2 import Array
 MAX_GAP = 1.0  # s; longest interpolated gap between poses of the reference
 SPAN = 10.0  # s; positions and odometry are compared over time spans of this length
 SMALL = 0.1  # a smaller ratio of the distance by positions to the distance by odometry causes a warning
-DRIVEN = 1.0  # m; time spans in which the robot drives less are not compared
+DRIVEN = 1.0  # m; time spans with a shorter path of the robot are not compared
 
 
 def summarize(log: Log) -> Summary:

@@ -25,7 +25,7 @@ from factors.rfid.kernels import FAST
 from factors.se2 import Array
 
 COARSE = 3  # size of cells and of height steps, as a multiple of those in the tables of the antennas
-FACINGS = 24  # number of directions in which a tag can face
+FACINGS = 24  # number of possible facings of a tag, evenly spaced
 UNREAD = 1e-3  # a tag is out of range if no read probability exceeds that of a false read by more than this
 MOST_LOOKS = 1 << 16  # maximum number of rounds on a path
 

@@ -30,7 +30,7 @@ from factors.rfid.signals import (
 from factors.rfid.tag_states import FARTHEST, TagStates, sigma_poses
 from factors.se2 import Array, Integers
 
-CONFIRMED = 1.0  # s; a read updates the state of a tag only after this time, in which a wrong pose is detected
+CONFIRMED = 1.0  # s; a read updates the state of a tag only after this time; a wrong pose is detected earlier
 CLEAR = math.log(0.99 / 0.01)  # minimum log-odds of a tag that is clearly dead, weak or moved
 WIDENED = 4.0  # multiplies the standard deviations of the pose, because successive scans share its error
 STANDING = np.zeros(3)  # velocity of a robot at rest
@@ -141,15 +141,13 @@ class KnownTags:
         return np.array([(a.x, a.y) for a in model.antennas]) if model.fixed else self.map.tags.points[:, :2]
 
     def exclude(self, antenna: int) -> str:
-        """Ignore the rounds of the antenna with the index ``antenna`` until it reads a tag. Returns the antenna's
-        name."""
+        """Ignore the rounds of the antenna number ``antenna`` until it reads a tag. Returns the antenna's name."""
         self._excluded.add(antenna)
         self._rounds = {}
         return self.antennas[antenna]
 
     def temper(self, tempering: float) -> None:
-        """Set the exponent of the likelihood to ``tempering`` or the rig's value, whichever is smaller, times
-        ``trust``."""
+        """Set the exponent of the likelihood: the smaller of ``tempering`` and the rig's value, times ``trust``."""
         new = min(self._tempering, tempering) * self.trust
         if new != self.likelihood.model.tempering:
             self.likelihood = self.likelihood.tempered(new)
@@ -200,7 +198,7 @@ class KnownTags:
         return TagReadCounts(np.zeros((len(used), 3)), used, rounds, hits, odds, elsewhere, tags, prior, twists)
 
     def weigh_states(self, counts: TagReadCounts, pose: Array, covariance: Array, parameters: Array) -> TagEvidence:
-        """Return the likelihood of the reads and misses ``counts`` for each state of the tags in range.
+        """Return the likelihood of ``counts``, reads and misses, if a tag in range is as surveyed, weak, moved or dead.
 
         ``pose`` (3,) with body-frame ``covariance`` (3, 3): the estimated pose before the scan corrects it.
         ``parameters`` (Q,): the estimated parameters of the read likelihood.

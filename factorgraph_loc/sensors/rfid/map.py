@@ -56,8 +56,8 @@ class TagsFile(ColumnMapping):
 
 
 def read_layer(content: Any, source: object, folder: Path) -> Any:
-    """Return the tags of a world file. ``content``: the section ``tags`` of the file. If it names a table, the tags are
-    read from this table in ``folder``. ``source``: the name of the world file in messages."""
+    """Return the tags of a world file by EPC. ``content``: the section ``tags`` of the file. If it names a table, the
+    tags are read from this table in ``folder``. ``source``: the name of the world file in messages."""
     if isinstance(content, str):
         return read_tags(inside(folder, content, source))
     if isinstance(content, dict) and isinstance(content.get("file"), str):

@@ -127,8 +127,7 @@ class BurstMonitor:
 
     @property
     def overdispersion(self) -> float:
-        """The estimated overdispersion, 1 for independent reads. Small values become 1, because they occur by
-        chance."""
+        """The estimated overdispersion, 1 for independent reads. Values only a little above 1 are replaced by 1."""
         ratio = float(self._sums[0] / self._sums[1])
         return ratio if ratio > INDEPENDENT else 1.0
 
@@ -279,8 +278,7 @@ class ConsistencyMonitor:
 
     @property
     def shares(self) -> str:
-        """A text with the ratio of observed to predicted reads of the antennas and distances with the largest
-        errors."""
+        """A text with ratios of observed to predicted reads, for antennas and distances with the largest errors."""
         groups = self._groups.large()
         return self._groups.shares(groups if len(groups) else self._groups.large(1.0))
 

@@ -226,8 +226,7 @@ class TagSensor(Sensor):
                 self._diagnostics.event(t, "doubted_model", DOUBTED_MODEL, shares=self._consistency.shares)
 
     def _values(self, view: View) -> dict[str, Array]:
-        """Return the estimated parameters (P,) of the detection models, by the name of their state block. {} if there
-        are none."""
+        """Return the estimated parameters (P,) of the detection models by state block, or {} if there are none."""
         value = view.value(self.name) if self._blocks else None
         return {} if value is None else {self.name: value}
 
@@ -314,8 +313,8 @@ class TagSensor(Sensor):
 
 
 def bind(binding: Binding) -> TagSensor | None:
-    """Return the RFID sensor of a run, or None if the run does not use it. Raises InputError if the run uses strength
-    or phase, and the rig lacks their model or antennas on the robot."""
+    """Return the RFID sensor of a run, or None if the run does not use it. ``binding``: the arguments of the sensor.
+    Raises InputError if the run uses strength or phase, and the rig lacks their model or antennas on the robot."""
     settings, sensors = binding.setup.rig.rfid, binding.setup.sensors
     signals = [signal for signal in ("rssi", "phase") if signal in sensors]
     if settings is not None and settings.tags and signals:

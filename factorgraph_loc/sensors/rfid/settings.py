@@ -37,8 +37,8 @@ class PriorSettings(FileModel):
 
 
 class RfidUncertainty(FileModel):
-    """Standard deviations of the yaws of antennas and of the time offset before a run. Constants above 0 are estimated.
-    The defaults are proportional to the largest ``prior.range_scale`` of the detection models."""
+    """Standard deviations of the yaws of antennas and of the time offset before a run. A constant is estimated if its
+    value is above 0. The defaults are proportional to the largest ``prior.range_scale`` of the detection models."""
 
     yaw: Annotated[float, Field(ge=0.0, le=1.0), InUnit("rad")] | None = None
     """standard deviation of a yaw that all antennas share; by default 0.35 times the largest prior.range_scale"""
@@ -203,7 +203,7 @@ RACKHAM_RADIUS = 0.25  # m; distance of the antennas from the centre of the robo
 
 
 def rackham(z: float = 1.0) -> dict[str, AntennaSettings]:
-    """Return eight antennas around a robot at the height ``z`` [m], by name."""
+    """Return the mounting of eight antennas, "1" to "8", on a circle around the robot at the height ``z`` [m]."""
     out = {}
     for i in range(8):
         yaw = se2.wrap_scalar(i * math.pi / 4.0)

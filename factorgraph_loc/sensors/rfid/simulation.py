@@ -50,7 +50,7 @@ class SimulatedRssiSettings(FileModel):
 
 
 class Fading(FileModel):
-    """Settings of fades: time intervals in which an antenna cannot read a tag. They are independent for each pair of an
+    """Settings of fades: time intervals without reads of a tag by an antenna. They are independent for each pair of an
     antenna and a tag."""
 
     duration: Annotated[float, Field(ge=1e-3, le=1000.0), InUnit("s")] = 2.0
@@ -82,7 +82,7 @@ class ClockJump(FileModel):
 
 
 class Silence(FileModel):
-    """A time interval in which no antenna reads a tag."""
+    """A time interval without reads by any antenna."""
 
     time: Duration
     """start of the interval without reads"""
@@ -282,8 +282,8 @@ def simulate(ride: Ride) -> Simulated:
 
 
 def looks(settings: Any) -> dict[str, float]:
-    """Return {"tags": N}, where N is rounds per second times antennas times tags. Raises ValueError if rig and world do
-    not fit together, or if a fault names an unknown antenna."""
+    """Return {"tags": N}, where N is rounds per second times antennas times tags. ``settings``: those of the
+    simulation. Raises ValueError if rig and world do not fit together, or if a fault names an unknown antenna."""
     if settings.rig.find(RfidSettings) is None:
         raise ValueError("the rig has no section [rfid], expected one with antennas")
     rfid, fixed = settings.rig.of(RfidSettings), settings.world.antenna_names()
@@ -339,8 +339,8 @@ class SimulatedReader:
 
 
 def on_robot(world: World, rig: Rig, settings: Any, rng: np.random.Generator) -> SimulatedReader:
-    """Return the simulated reader of a rig for active localization. Raises InputError if ``settings`` have faults, or
-    if the antennas are fixed in the building, because this is not supported."""
+    """Return the simulated reader of a rig for active localization. ``settings``: those of the simulation. Raises
+    InputError if they have faults, or if the antennas are fixed in the building, because this is not supported."""
     if is_fixed(rig):
         raise InputError(f"{settings.name}: has antennas in the map, expected antennas on the robot for active runs")
     if settings.faults != FaultSettings():

@@ -33,7 +33,7 @@ from factors.rfid.signals import PhaseReads
 from factors.se2 import Array, Integers
 
 MAX_GAP = 0.1  # s; longest interpolated gap between reference poses
-PHASE_WINDOW = 2.0  # s; length of the time windows in which phases are compared
+PHASE_WINDOW = 2.0  # s; length of the time windows for the comparison of phases
 
 ANTENNA = named("antenna", "the name of an antenna")
 RFID = Table(
@@ -117,7 +117,7 @@ class RfidStream(Stream):
 
     @cached_property
     def number(self) -> Integers:
-        """The number (N,) of the round of each row, from 0 to R - 1 for the R rounds of the log."""
+        """The index (N,) of the round of each row, from 0 to R - 1 for the R rounds of the log."""
         scan = np.cumsum(np.diff(self.t, prepend=np.nan) != 0.0).tolist()
         numbers: dict[tuple[int, int], int] = {}
         keys = zip(scan, self.round.tolist(), strict=True)
@@ -267,9 +267,9 @@ def phase_reads(
 ) -> PhaseReads:
     """Return the reads with a phase along the reference of a log, with poses in the world frame.
 
-    ``tags``, ``antennas``: see :func:`along_reference`. ``window``: the length [s] of the time windows in which phases
-    are compared. ``first_window``: the number of the first window. Raises InputError if the log has no reference or no
-    reads.
+    ``tags``, ``antennas``: see :func:`along_reference`. ``window``: the length [s] of the time windows. Phases are only
+    compared within a window. ``first_window``: the number of the first window. Raises InputError if the log has no
+    reference or no reads.
     """
     stream, rows, t, poses, antenna, tag = along_reference(log, tags, antennas)
     windows = first_window + np.floor((t - t.min(initial=np.inf)) / window).astype(np.int64)

@@ -138,7 +138,8 @@ def summarize_rfid(log: Log) -> RfidSummary | None:
 
 
 def rfid_problems(log: Log, summary: RfidSummary) -> list[Notice]:
-    """Return warnings about the tags, the antennas and the clock of the reader in a log."""
+    """Return warnings about the tags, the antennas and the clock of the reader in a log. ``summary``: the summary of
+    the log."""
     out, fixed = list[Notice](), is_fixed(log.rig)
     if summary.unread:
         sentence = f"{{unread}} of {{tags}} {ON_ROBOT if fixed else IN_MAP} are never read: {{names}}"
@@ -291,7 +292,7 @@ TOGETHER = 2.0  # an overdispersion above this multiple of 1 / tempering causes 
 
 @dataclass(frozen=True, eq=False)
 class _Trials:
-    """M trials. A trial is one round of one antenna in which it may read one tag.
+    """M trials. A trial is one round of one antenna that may read one tag.
 
     ``p`` (M,): predicted probability of a read. ``hit`` (M,): 1 for a read, otherwise 0. ``antenna``, ``tag`` (M,):
     indices of antenna and tag. ``block`` (M,): number of the time block. ``distance`` (M,): from antenna to tag [m].

@@ -113,8 +113,8 @@ class ReadsByRound:
 
 
 def assemble(rows: Mapping[str, TableRows], reading: Reading) -> RfidStream:
-    """Return the reads of a log as a stream. Without the table "inventories", gaps between reads separate rounds.
-    ``rows``: the rows by table name."""
+    """Return the reads of a log as a stream. Without the table "inventories", gaps between reads separate inventory
+    rounds. ``rows``: the rows by table name. ``reading``: rig, time origin, and a list to append warnings to."""
     settings = reading.rig.find(RfidSettings)
     gap = ROUND_GAP if settings is None else settings.round_gap
     return read_rounds(rows.get("rfid"), rows.get("inventories"), gap, reading.warnings).stream(reading.t0_ns)
@@ -204,7 +204,8 @@ def _rounds(reads: TableRows, rows: Integers, number: Integers, end_ns: Integers
 
 
 def disassemble(stream: RfidStream, writing: Writing) -> dict[str, Columns]:
-    """Return the columns of the tables "rfid" and "inventories". The duration of a round begins at its first read."""
+    """Return the columns of the tables "rfid" and "inventories". The duration of a round begins at its first read.
+    ``writing``: the time origin."""
     number, first = stream.number, stream.first_rows
     end_ns = checks.absolute(stream.t, writing.t0_ns)
     age_ns = np.rint(stream.age * 1e9).astype(np.int64)

@@ -36,9 +36,9 @@ class RfidCalibrator(Calibrator):
     def learn(
         self, traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path | None, like: SensorKnowledge | None = None
     ) -> SensorKnowledge:
-        """Return the survey transform, the mounting and the detection models. See :meth:`Calibrator.learn`. With
-        smoothed trajectories, the survey transform is not estimated. Raises InputError without antennas or for too
-        short logs."""
+        """Return the transform of surveyed tags to the world, the mounting of antennas, and the models of the read
+        probability. See :meth:`Calibrator.learn`. With smoothed trajectories, the transform is not estimated. Raises
+        InputError without antennas or for too short logs."""
         logs = [replace(trace.log, rig=rig) for trace in traced]
         if self.channel not in logs[0].streams or self.channel not in rig.sensors:
             return SensorKnowledge()
@@ -71,7 +71,8 @@ class RfidCalibrator(Calibrator):
         return super().is_complete(rig) and (rig.rfid is None or rig.rfid.models != default_models())
 
     def pictures(self, knowledge: SensorKnowledge) -> Sequence[Part]:
-        """Return a title and a plot of the read probability around the antennas, or () without detection models."""
+        """Return a title and a plot of the read probability around the antennas, or () without detection models.
+        ``knowledge``: the result of :meth:`learn`."""
         if knowledge.details is None:
             return ()
         text = "Probability of a read around the antenna (triangle): observed on the left, the model on the right."

@@ -67,10 +67,10 @@ BURSTS = 1.3  # minimum overdispersion for a change of the tempering
 
 @dataclass(frozen=True)
 class RfidFit:
-    """Fitted detection models and their data, for the plots of the calibration report.
+    """Fitted detection models and their data. The calibration report plots them.
 
     ``models``: the models. ``which``: the index in ``models`` for each antenna. ``antennas``: names of the antennas.
-    ``kind``: the kind of all models. ``pairs``: the reads and misses to which the models are fitted.
+    ``kind``: the kind of all models. ``pairs``: the reads and misses that the models are fitted to.
     """
 
     models: tuple[DetectionModel, ...]
@@ -245,8 +245,8 @@ def _overdispersion(pairs: TagPairs, logit: Array, floor: Floor) -> tuple[float,
 
 
 def _geometry_by_phases(logs: Sequence[Log], settings: RfidSettings, survey: SurveySettings) -> PhaseFit | None:
-    """Return the survey transform and the lever arm estimated from phases. Returns None if there are too few phases, or
-    if the phases do not agree better with the estimates than with ``survey`` and ``settings``."""
+    """Return the survey transform and the correction of antenna positions, estimated from phases. Returns None if there
+    are too few phases, or if they do not agree better with the estimates than with ``survey`` and ``settings``."""
     try:
         phase = fit_phase(logs, settings, survey)
     except InputError:
@@ -255,8 +255,8 @@ def _geometry_by_phases(logs: Sequence[Log], settings: RfidSettings, survey: Sur
 
 
 def _priors_of(phase: PhaseFit, survey: SurveySettings) -> dict[str, tuple[float, float]]:
-    """Return the changes of survey transform and lever arm that phases determine: (mean, standard deviation) by name,
-    such as "antennas.x". ``survey``: the transform before the fit."""
+    """Return the changes of survey transform and antenna positions that phases determine: (mean, standard deviation) by
+    name, such as "antennas.x". ``survey``: the transform before the fit."""
     shift = (phase.survey.x - survey.x, phase.survey.y - survey.y, phase.survey.heading - survey.heading)
     names = (*SURVEY, "antennas.x", "antennas.y")
     return dict(zip(names, zip((*shift, *phase.lever_arm), phase.sigmas.tolist(), strict=True), strict=True))

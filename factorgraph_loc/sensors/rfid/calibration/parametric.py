@@ -122,8 +122,7 @@ def scaled(start: GridModel) -> Family:
 
 
 def family_of(model: DetectionModel, pairs: TagPairs) -> Family:
-    """Return the family of models of the same kind as ``model``. ``pairs``: the data from which the priors of logistic
-    models are computed."""
+    """Return the family of models of the same kind as ``model``. ``pairs``: data for the priors of logistic models."""
     if isinstance(model, BeamModel):
         return beam(model)
     return scaled(model) if isinstance(model, GridModel) else logistic(pairs, with_facing=model.uses_facing)
@@ -189,8 +188,8 @@ def estimate_geometry(
     """Return maximum a posteriori estimates of the survey transform and of the mounting of the antennas.
 
     They are estimated together with a logistic model for all antennas. Returns ``settings`` and ``survey``, both
-    updated, and the posterior of the changes. ``focus``: see :func:`geometry_parameters`. ``with_facing``: True if the
-    model depends on the facing of tags.
+    updated, and the posterior of the changes. ``floor``: probabilities of false reads and misses. ``focus``: see
+    :func:`geometry_parameters`. ``with_facing``: True if the model depends on the facing of tags.
     """
     count = max(len(nearby(log, settings, survey)) for log in logs)
     logs = [log.part(np.arange(len(log.t)) % (1 + count // MOST_PAIRS) == 0) for log in logs]

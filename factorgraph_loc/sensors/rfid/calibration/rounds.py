@@ -22,7 +22,7 @@ from factorgraph_loc.text import listed
 from factors.rfid.detection import TagArray
 from factors.se2 import Array
 
-CELL = (0.05, 0.05, 0.05, 1.0)  # m, m, rad, antenna index; size of the cells in which rounds are merged
+CELL = (0.05, 0.05, 0.05, 1.0)  # m, m, rad, antenna index; size of the cells for the merging of rounds
 MOST_ROUNDS = 20.0  # maximum number of rounds that a pose counts, so that a robot at rest does not dominate the data
 MIN_ROUNDS = 100
 

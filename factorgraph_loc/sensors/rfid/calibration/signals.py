@@ -117,7 +117,7 @@ class _Focus:
         return replace(self, reads=self._likelihood(state).near(self._pose(state), self.reads))
 
     def without(self, block: int) -> _Focus:
-        """Return a copy without the reads of the time block number ``block``, for the jackknife."""
+        """Return a copy without the reads of the time block number ``block`` (jackknife)."""
         edges = np.linspace(0, int(self.reads.windows.max()) + 1, BLOCKS + 1)
         inside = (self.reads.windows >= edges[block]) & (self.reads.windows < edges[block + 1])
         return replace(self, reads=self.reads.chosen(~inside))
