@@ -32,7 +32,7 @@ class Group(Mapping[str, Any]):
 
     ``kind``: name of the kind, such as "sensors". ``own``: import paths of the built-in plug-ins by name. ``needs``:
     names of the attributes that a plug-in must have. Getting a plug-in of another package raises InputError if it
-    cannot be imported, lacks an attribute, or has a name that is already registered.
+    cannot be imported or lacks an attribute. Names that are already registered raise InputError too.
     """
 
     def __init__(self, kind: str, *needs: str) -> None:

@@ -131,7 +131,7 @@ def error_text(error: BaseException) -> str:
 
 
 def plain_values(value: Any) -> Any:
-    """Return a value with types that JSON has.
+    """Return ``value``, converted to types that JSON has.
 
     Data classes and mappings become dictionaries, arrays and tuples become lists, and NaN and infinity become None.
     """

@@ -125,9 +125,9 @@ def require_format(out: Path) -> None:
 
 
 def write(log: Log, runs: list[StoredRun], out: Path) -> list[Path]:
-    """Write results in the format that the suffix of ``out`` selects, and return the written files.
+    """Write a log and its runs, a trajectory, or points of a map to ``out``. Return the written files.
 
-    They are a log and its runs, a trajectory, or points of a map.
+    The suffix of ``out`` selects the content and the format.
     """
     if out.suffix == ".mcap":
         write_mcap(log, runs, out)

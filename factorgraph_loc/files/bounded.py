@@ -139,7 +139,7 @@ def foreign(source: object, what: str) -> Iterator[None]:
 
 
 def limit_memory() -> None:
-    """Make :func:`limited_memory` effective. Commands call this; programs that import the package do not."""
+    """Enable :func:`limited_memory`, which is off by default for programs that import the package."""
     _limited.set()
 
 

@@ -58,7 +58,7 @@ class Cells:
             object.__setattr__(self, "resumed", np.zeros(len(self.rows), dtype=bool))
 
     def texts(self, name: str) -> list[str]:
-        """Return the N cells of a field as texts."""
+        """Return the N cells of the field ``name`` as texts."""
         return [str(cell) for cell in self.columns[name]]
 
     def names(self, name: str, column: Column) -> list[str]:
@@ -68,9 +68,10 @@ class Cells:
         return texts
 
     def numbers(self, name: str, column: Column) -> Array:
-        """Return the numbers (N,) in a field, converted to ``column.unit``. Empty cells become NaN.
+        """Return the numbers (N,) in the field ``name``, converted to ``column.unit``. Empty cells become NaN.
 
-        Raises InputError at the first cell that is no finite number, is out of bounds, or is empty although ``column`` forbids it.
+        Raises InputError at the first cell that is no finite number or is out of bounds. Raises InputError also at an
+        empty cell if ``column`` forbids it.
         """
         values, faults = self._numbers(name, column)
         self.require(faults)
@@ -81,7 +82,7 @@ class Cells:
         return self._of_one_log(self._known(self._nanoseconds()))
 
     def stamps(self, name: str, offset: float = 0.0) -> Integers:
-        """Return the timestamps (N,) [ns] in a field, plus ``offset`` [s].
+        """Return the timestamps (N,) [ns] in the field ``name``, plus ``offset`` [s].
 
         The unit of the field is s, ms, us, ns or iso. The unit iso means a date and time, in UTC if without a time
         zone. Raises InputError for other units, invalid cells, and timestamps that are too far apart.

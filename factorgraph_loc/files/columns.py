@@ -78,7 +78,7 @@ class Column:
 
     @cached_property
     def measured(self) -> Column:
-        """The column as described for a ``Stream``: ``name`` is ``field``, ``low`` is at least ``left_out_below``."""
+        """The column of an attribute of a ``Stream``. ``name`` is ``field``; ``low`` is at least ``left_out_below``."""
         return replace(self, name=self.field or self.name, low=max(self.low, self.left_out_below))
 
     @property

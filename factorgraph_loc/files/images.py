@@ -43,7 +43,7 @@ def image_size(content: bytes, source: object) -> tuple[int, int]:
     """Return the width and height [px] of an image from its header. ``content``: bytes of the file ``source``.
 
     Raises InputError if the image is invalid or has too many pixels. Raises InputError also if a PNG has a chunk that
-    claims to be longer than the file, because OpenCV would allocate memory for it.
+    claims to be longer than the file. OpenCV would allocate memory for this length.
     """
     at = len(PNG) if content.startswith(PNG) else len(content)
     while at + 8 <= len(content):

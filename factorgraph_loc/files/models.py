@@ -248,7 +248,10 @@ def set_key(content: dict[str, Any], key: str, value: Any, source: object) -> No
 
 
 def flattened(content: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield (path, value) for each value in the nested tables ``content``. A path is ``prefix`` plus ``a.b.c``."""
+    """Yield (path, value) for each value in the nested tables ``content``.
+
+    A path is ``prefix`` and the keys that lead to the value, joined by dots: ``a.b.c``.
+    """
     for key, value in content.items():
         if isinstance(value, Mapping):
             yield from flattened(value, f"{prefix}{key}.")

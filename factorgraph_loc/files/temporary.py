@@ -40,8 +40,7 @@ def temporary_file(path: Path) -> AbstractContextManager[Path]:
 
 
 def temporary_folder(path: Path) -> AbstractContextManager[Path]:
-    """Return a context manager that creates a folder next to ``path``, with access only for this user, and gives its
-    path.
+    """Return a context manager that creates a folder next to ``path`` for this user only, and gives its path.
 
     The folder and its content are removed at the end of the block.
     """

@@ -126,7 +126,7 @@ class Guess:
         return None
 
     def values(self, name: str) -> Array:
-        """Return the numbers (N,) of a field. Returns an empty array if its column is not numeric."""
+        """Return the numbers (N,) of the field ``name``, or an empty array if its column is not numeric."""
         values = self.numbers(self.fields[name])
         return np.empty(0) if values is None else values
 

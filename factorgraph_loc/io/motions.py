@@ -90,11 +90,11 @@ def wheels_of(left: str, count: int) -> tuple[str, ...]:
 def between_poses(
     source: object, t_ns: Integers, poses: Array, warnings: list[Notice], lost_ns: Integers = NO_STAMPS
 ) -> Array:
-    """Return the motions (N - 1, 3) between odometry poses: x, y [m] and heading [rad] in the earlier body frame.
+    """Return the motions (N - 1, 3) from each odometry pose to the next one: x, y [m] and heading [rad].
 
-    ``poses`` (N, 3): x, y, heading. ``t_ns`` (N,): their timestamps. At a reset of the odometry to the origin, the
-    motion before it is repeated. Then a warning about ``source`` is appended to ``warnings``. ``lost_ns``: timestamps
-    at which the device had no pose.
+    A motion is in the body frame of the pose that it begins at. ``poses`` (N, 3): x, y, heading. ``t_ns`` (N,): their
+    timestamps. At a reset of the odometry to the origin, the motion before it is repeated. Then a warning about
+    ``source`` is appended to ``warnings``. ``lost_ns``: timestamps at which the device had no pose.
     """
     moves = se2.between(poses[:-1], poses[1:])
     durations = _durations(t_ns)
@@ -136,10 +136,10 @@ def bridge_losses(t_ns: Integers, moves: Array, lost_ns: Integers) -> tuple[Inte
 
 
 def integrate_velocities(t_ns: Integers, velocities: Array) -> Array:
-    """Return the motions (N - 1, 3) between N timestamps: x, y [m] and heading [rad] in the earlier body frame.
+    """Return the motions (N - 1, 3) of a robot between N timestamps: x, y [m] and heading [rad].
 
-    ``velocities`` (N, 2): forward [m/s] and turn rate [rad/s]. A velocity is constant until the next of the timestamps
-    ``t_ns`` (N,), for at most :data:`HOLD_TIME`. After that the robot stands still.
+    A motion is in the body frame at its beginning. ``velocities`` (N, 2): forward [m/s] and turn rate [rad/s], constant
+    until the next of the timestamps ``t_ns`` (N,), for at most :data:`HOLD_TIME`. After that the robot stands still.
     """
     twists = np.column_stack((velocities[:-1, 0], np.zeros(len(velocities) - 1), velocities[:-1, 1]))
     return np.asarray(se2.exp(twists * np.minimum(np.diff(t_ns) / 1e9, HOLD_TIME)[:, None]))
@@ -168,10 +168,12 @@ def wheel_motions(source: object, t_ns: Integers, distances: Array, scales: Arra
 def motion_of_wheel_distances(
     source: object, t_ns: Integers, distances: Array, scales: Array, sizes: WheelSizes, warnings: list[Notice]
 ) -> Array:
-    """Return the motions (N - 1, 3) of a robot: x, y [m] and heading [rad] in the earlier body frame.
+    """Return the motions (N - 1, 3) of a robot between N timestamps: x, y [m] and heading [rad].
 
-    ``distances`` (N, W): total distances [m] of W = 2 or 4 wheels (left, right, rear left, rear right) at N timestamps.
-    ``scales`` (W,): metres per encoder count. Warnings about the file ``source`` are appended to ``warnings``.
+    A motion is in the body frame at its beginning. ``distances`` (N, W): total distances [m] of W = 2 or 4 wheels
+    (left, right, rear left, rear right) at ``t_ns`` (N,). ``scales`` (W,): metres per encoder count, to correct
+    encoders that wrap. ``sizes``: the sizes of the drive. Warnings about the file ``source`` are appended to
+    ``warnings``.
     """
     return se2.exp(sizes.twists(source, wheel_motions(source, t_ns, distances, scales, warnings), warnings))
 

@@ -41,7 +41,7 @@ class Estimates:
 
     @classmethod
     def of(cls, table: pl.DataFrame, t0_ns: int) -> "Estimates":
-        """Return the estimates in rows of ``estimates.parquet``, with times [s] since ``t0_ns`` [ns]."""
+        """Return the estimates in ``table``, rows of ``estimates.parquet``, with times [s] since ``t0_ns`` [ns]."""
         numbers = {name: table[name].fill_null(np.nan).to_numpy() for name in NUMBERS}
         covariances = symmetric([numbers[name] for name in COVARIANCES])
         t = (table[STAMP].to_numpy() - t0_ns) / 1e9

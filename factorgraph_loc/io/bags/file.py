@@ -225,7 +225,7 @@ def is_bag(path: Path) -> bool:
 
 
 def require_metadata(folder: Path) -> None:
-    """Raise InputError if ``folder`` has the files of a bag of version 2, but no metadata.yaml."""
+    """Raise InputError if ``folder`` has the files of a ROS 2 bag, but no metadata.yaml."""
     files = sorted(file.name for file in folder.iterdir() if file.suffix in SUFFIXES[1:]) if folder.is_dir() else []
     if files and not (folder / METADATA).is_file():
         advice = f"`ros2 bag reindex {folder}` writes it; a single file, {folder / files[0]}, can be read without it"

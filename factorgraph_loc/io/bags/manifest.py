@@ -347,7 +347,7 @@ def _ranges(out: Uses, custom: Sequence[tuple[Topic, Sequence[str]]]) -> dict[st
 
 
 def range_fields(paths: Sequence[str]) -> dict[str, str]:
-    """Return the paths of two message fields by name: "landmark", the name of a landmark, and "range", its distance.
+    """Return the paths of two message fields, with the keys "landmark" (name of a landmark) and "range" (its distance).
 
     ``paths``: the paths of all fields of the message type. The two fields are recognised by common names. Returns an
     empty dictionary if one of the two is missing.
@@ -361,7 +361,7 @@ def range_fields(paths: Sequence[str]) -> dict[str, str]:
 
 
 def read_fields(paths: Sequence[str]) -> dict[str, str]:
-    """Return the paths of the message fields with the values of an RFID read, by "epc", "antenna", "rssi" and so on.
+    """Return the paths of the message fields of an RFID read, with the keys "epc", "antenna", "rssi" and so on.
 
     ``paths``: the paths of all fields of the message type. Fields are recognised by common names.
     """

@@ -88,10 +88,9 @@ class JointRows:
             self.rows.append(item, t_ns, [values[names.index(joint)] for joint in self._wheels.joints])
 
     def pairs(self, warnings: list[Notice]) -> tuple[Integers, Array]:
-        """Return the timestamps (N,) [ns] and the collected values (N, W) of W wheels, in order of time.
+        """Return timestamps (N,) [ns] and the angles or angular velocities (N, W) of W wheels, in order of time.
 
-        If invalid rows are skipped, a warning is appended to ``warnings``. Raises InputError if no message has all
-        joints.
+        Skipped rows add a warning to ``warnings``. Raises InputError if no message has all joints.
         """
         joints = self._wheels.joints
         if not len(self.rows):
@@ -145,7 +144,7 @@ class ImuTopic(RowTopic, Turned):
 
 
 class YawRates:
-    """Collects the angular velocities of an IMU topic, and computes the turn rate of the robot from them."""
+    """Collects the angular velocities from an IMU topic, and computes the yaw rate of the robot from them."""
 
     def __init__(self, bag: Bag, options: ImuTopic, frames: StaticFrames) -> None:
         topic = bag.topic(options.topic, IMU)

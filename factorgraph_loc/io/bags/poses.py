@@ -170,10 +170,9 @@ class StaticFrames:
         return None if common is None else np.linalg.inv(theirs[common]) @ ours[common]
 
     def known(self, source: str, frame: str) -> Array:
-        """Return the pose (4, 4) of ``frame`` in the frame of the robot.
+        """Return the pose (4, 4) of ``frame`` in the frame of the robot. ``source``: names the topic in the error.
 
-        Raises InputError if no transforms connect the two frames. ``source``: names the topic that needs the pose, for
-        the error.
+        Raises InputError if no transforms connect the two frames.
         """
         pose = self.pose(frame)
         if pose is None:
@@ -323,7 +322,7 @@ class Tree:
         return next((name for name in ROBOT if name in self.parents), None)
 
     def above(self, frame: str, names: tuple[str, ...]) -> str | None:
-        """Return the first frame of ``names`` that is an ancestor of ``frame`` and moves relative to it, or None."""
+        """Return the first of ``names`` that is an ancestor of ``frame`` and not rigidly connected to it, or None."""
         chain = frame_and_ancestors(self.parents, frame)
         first = next((i for i, name in enumerate(chain) if name in self.moving), len(chain))
         return next((name for name in names if name in chain[first + 1 :]), None)

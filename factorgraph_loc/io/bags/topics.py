@@ -41,7 +41,7 @@ MAX_DELAY = 0.5  # s; larger differences between topics are clock offsets, not d
 
 
 class TopicSettings(FileModel):
-    """The settings that each ROS topic has, for example that of a camera."""
+    """Base class of the settings of a ROS topic: its name and its clock."""
 
     topic: str
     """name of the topic"""
@@ -235,12 +235,12 @@ class TopicRows:
         return self.t_ns[keep], self.values[keep]
 
     def kept(self, faults: Sequence[Fault], warnings: list[Notice], among: Integers | None = None) -> Integers:
-        """Return the indices of the rows without ``faults``, in order of time. Of equal timestamps, the last row is
-        used.
+        """Return the indices of the valid rows in order of time. Of rows with equal timestamps, only the last is
+        returned.
 
-        ``faults``: mark invalid cells. ``among``: indices of the rows that they describe; other rows are not returned.
-        None: all rows. Raises InputError at an invalid or late row, unless ``rules`` skip or sort it. Then a warning is
-        appended to ``warnings``.
+        ``faults``: the invalid cells. ``among``: indices of the rows that ``faults`` describe; other rows are not
+        returned. None: all rows. Raises InputError at an invalid or late row, unless ``rules`` skip or sort it. Then a
+        warning is appended to ``warnings``.
         """
         rows, t_ns = self.rows, self.t_ns
         keep = np.arange(len(rows)) if among is None else among

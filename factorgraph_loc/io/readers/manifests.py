@@ -29,8 +29,7 @@ class StartSettings(FileModel):
     t_ns: Annotated[int, Field(ge=-LATEST, le=LATEST), InUnit("ns")] | None = None
 
     def pose(self, t0_ns: int) -> StartPose:
-        """Return the start pose of a log. ``t0_ns``: the absolute time of the log's t = 0 [ns], which its time counts
-        from."""
+        """Return the start pose, with its time [s] since ``t0_ns`` [ns], the absolute time of the log's t = 0."""
         t = 0.0 if self.t_ns is None else (self.t_ns - t0_ns) / 1e9
         sigmas = np.array((self.sigma_position, self.sigma_position, self.sigma_heading))
         return StartPose(t, np.array((self.x, self.y, self.heading)), sigmas)

@@ -94,8 +94,7 @@ add_fields(Options, {name: (_type_of(name), None) for name in OTHERS}, after="ca
 
 
 def read(path: Path | None, options: Options) -> Log:
-    """Return the log in the folder ``path``, which has tables of other programs. ``options``: the columns of the
-    tables.
+    """Return the log in the folder ``path`` with tables of other programs. ``options``: the columns of the tables.
 
     Its t = 0 is the first timestamp of the sensors. Raises InputError with file, row and column of an invalid value.
     """

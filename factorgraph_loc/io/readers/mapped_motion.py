@@ -112,8 +112,7 @@ def read_odometry(folder: TableFolder, options: OdometryFile) -> tuple[Integers,
 
 
 def read_reference(folder: TableFolder, options: ReferenceFile, t0_ns: int) -> Trajectory:
-    """Return the reference trajectory from the file in ``folder`` that ``options`` name, with times [s] since ``t0_ns``
-    [ns].
+    """Return the reference trajectory from the file of ``options`` in ``folder``, with times [s] since ``t0_ns`` [ns].
 
     Raises InputError with the file and the row of an invalid value.
     """

@@ -47,9 +47,9 @@ def read_wide(path: Path, mapping: ColumnMapping, antenna: str | None) -> Cells:
     """Return the reads of a table with several columns of signal strengths, whose names match a pattern such as
     ``rssi_*``.
 
-    Each cell that is not empty is a read. The text in place of ``*`` is the name of the antenna, or the EPC of the tag
-    if the antenna is known. The antenna is known if ``columns`` has it, or if ``antenna``, the name of the only
-    antenna, is given. Raises InputError at an invalid value.
+    Each cell that is not empty is a read. The text in place of ``*`` is the antenna's name, or the EPC of the tag if
+    the antenna is known. The antenna is known if ``columns`` has it, or if ``antenna``, the name of the only antenna,
+    is given. Raises InputError at an invalid value.
     """
     pattern = mapping.columns["rssi"]
     fixed = {field: column for field, column in mapping.columns.items() if field != "rssi"}
