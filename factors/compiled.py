@@ -51,8 +51,8 @@ class _Shared(FunctionCache):
     """A cache of one function's compiled code with a lock between processes.
 
     A process that does not find the code locks the function, compiles it, saves the code, and releases the lock. It may
-    also lock the functions that this function calls. Locks cannot block each other in a circle, because compiled
-    functions do not call each other in a circle. The operating system releases the locks of a process that ends.
+    also lock the functions that this function calls. Deadlocks are impossible, because compiled functions do not call
+    each other in a circle. The operating system releases the locks of a process that ends.
     """
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:

@@ -334,7 +334,7 @@ def _whitened(lower: Array, vector: Array, out: Array) -> float:
 
 @compiled(error_model="numpy")
 def _compressed(nll: float, gradient: Array, information: Array) -> tuple[Array, Array]:
-    """The compiled part of :func:`compressed`. The arrays must be contiguous."""
+    """Compute :func:`compressed` in compiled code. The arrays must be contiguous."""
     size, curvature, trace = len(gradient), information.copy(), 0.0
     residual, jacobian = np.empty(size + 1), np.zeros((size + 1, size))
     for i in range(size):

@@ -67,8 +67,7 @@ def poses_between(
     poses: Array,
     covariances: Array,
 ) -> tuple[Array, Array]:
-    """Interpolate M estimated poses to T times with the odometry. Returns poses (T, 3) and body-frame covariances (T,
-    3, 3).
+    """Interpolate M estimated poses to T times by odometry. Returns poses (T, 3) and body-frame covariances (T, 3, 3).
 
     ``previous`` (T,): the index of the last estimated pose before each of the T times.
     ``deltas`` (T, 3), ``noises`` (T, 3, 3), ``durations`` (T,) [s]: the odometry's motion from that pose to the time,

@@ -144,8 +144,8 @@ def _informed(prior: Array) -> _Solver:
 
 
 def _rooted(root: Array) -> _Solver:
-    """Make a solver of linearised updates in square-root form. Its covariances are always positive definite. ``root``
-    (S, S): lower Cholesky root of the covariance of the prediction."""
+    """Return a solver of linearised updates in square-root form. Its covariances are always positive definite. ``root``
+    (S, S): lower Cholesky factor of the predicted covariance."""
 
     def solve(blocks: Array, residual: Array, weight: Array, at: Array) -> tuple[Array, Array]:
         size, scale = len(at), np.sqrt(np.repeat(weight, blocks.shape[1]))

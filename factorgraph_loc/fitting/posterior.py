@@ -183,9 +183,9 @@ def by_block(scores: Array, block: Integers) -> Array:
 
 
 def blocks(times: Sequence[Array], length: float) -> Integers:
-    """Return the number of the time interval of each time in several logs, for all logs in one array. ``times``: an
-    array of times [s] for each log. ``length`` [s]: the length of the intervals. They are numbered consecutively over
-    all logs."""
+    """Return the number of the time interval of each measurement in several logs, in one array. ``times``: an array of
+    times [s] for each log. ``length`` [s]: the length of the intervals, which are numbered consecutively over all
+    logs."""
     out: list[Integers] = []
     first = 0
     for t in times:
@@ -195,8 +195,8 @@ def blocks(times: Sequence[Array], length: float) -> Integers:
 
 
 def robust_sigma(values: Array) -> Array:
-    """Return the robust standard deviation (D,) about zero of the columns of ``values`` (M, D), from their median
-    absolute value. NaN is ignored."""
+    """Return the median absolute value (D,) of each column of ``values`` (M, D), scaled to the standard deviation of a
+    zero-mean Gaussian. NaN is ignored."""
     return np.asarray(MAD_TO_SIGMA * np.nanmedian(np.abs(values), axis=0))
 
 

@@ -108,7 +108,7 @@ class ActiveRun:
 def run_active(
     simulation: SimulationSettings, policy: str, estimator: str, seed: int, settings: ActiveSettings | None = None
 ) -> ActiveRun:
-    """Simulate a robot that drives from an unknown start until it is localized, or too far, or for too long.
+    """Simulate a robot that drives from an unknown start until it is localized, or until a limit is reached.
 
     ``policy``, ``estimator``: names. Runs with the same ``seed`` have the same world, start and noise sequences. Raises
     InputError for an unknown name, a start that is not free, or a sensor that is faster than the robot's control.
@@ -136,8 +136,8 @@ def run_active(
 
 
 class _ClosedLoop:
-    """A simulated run: a policy chooses a path, the robot drives it, and measurements update the estimate, in a
-    loop."""
+    """A simulated run. Repeatedly a policy chooses a path, the robot drives it, and measurements update the
+    estimate."""
 
     def __init__(
         self, simulation: SimulationSettings, policy: str, estimator: str, seed: int, settings: ActiveSettings

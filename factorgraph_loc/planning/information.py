@@ -211,8 +211,9 @@ def _stations(passed: Array) -> Places:
 
 
 def _sigmas(path: Path, steps: Places, noise: OdometryModel) -> Array:
-    """Return the standard deviations (S, 3) of the motion to each of S stations from the previous one, in the robot
-    frame. ``steps`` (S,): the indices of the stations among the poses of ``path``. ``noise``: the noise of odometry."""
+    """Return the standard deviations (S, 3), in the robot frame, of the motion that leads to each of S stations. It is
+    zero for the first. ``steps`` (S,): the indices of the stations among the poses of ``path``. ``noise``: of the
+    odometry."""
     distance = np.diff(path.metres[steps])
     rotation = np.diff(path.turned[steps])
     out = np.zeros((len(steps), 3))

@@ -123,7 +123,7 @@ def _near_gains(s: Situation, paths: Sequence[Path]) -> Array:
 
 def _far_gains(s: Situation, paths: Sequence[Path]) -> Array:
     """Return the expected information (C,) [nats] of C paths to distant places. With one mode it is about the pose.
-    With several modes it is about the question which mode is true.
+    With several modes it is about which mode is true.
 
     The information about poses is then ignored. On a long path particles diverge and run into walls, which the real
     robot avoids by planning again.
@@ -146,7 +146,8 @@ def _far_gains(s: Situation, paths: Sequence[Path]) -> Array:
 
 
 def _costs(s: Situation, rows: Sequence[int], per_metre: float) -> Array:
-    """Return the penalties (K,) [nats] on the lengths of the candidates ``rows``. ``per_metre``: penalty per metre."""
+    """Return the penalties (K,) [nats] on the lengths of the candidates with indices ``rows``. ``per_metre``:
+    nats/m."""
     return per_metre * np.array([s.candidates[i].length for i in rows])
 
 

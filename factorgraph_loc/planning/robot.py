@@ -163,7 +163,7 @@ class SimulatedRobot:
             yield from self._passed(np.zeros(3))
 
     def _passed(self, reported: Array) -> Iterator[Measurement]:
-        """Advance the time by one control period, and yield its measurements. ``reported`` (3,): motion reported by
+        """Advance the time by one control period, and yield its measurements. ``reported`` (3,): the motion by
         odometry."""
         self.t = round(self.t + PERIOD, 6)
         self._truth.append((self.t, *self.pose.tolist()))

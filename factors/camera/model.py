@@ -109,8 +109,7 @@ def mounting(roll: float, pitch: float, yaw: float) -> Array:
 
 
 def angles_of_camera(rotation: Array) -> tuple[float, float, float]:
-    """Return the roll, pitch and yaw [rad] of a camera with ``rotation`` (3, 3) in the robot frame. Inverts
-    :func:`mounting`."""
+    """Return roll, pitch and yaw [rad] of a camera from its ``rotation`` (3, 3). The inverse of :func:`mounting`."""
     roll, pitch, yaw = gtsam.Rot3(rotation @ FORWARD.T).xyz().tolist()
     return roll, pitch, yaw
 

@@ -120,7 +120,7 @@ class PointPrior:
 
     @classmethod
     def of(cls, pose: Array, point: Array, sigma: float) -> PointPrior:
-        """Return the prior of a world ``point`` (3,) with standard deviation ``sigma`` [m], given a robot at ``pose``
+        """Return the prior of a world ``point`` (3,) with standard deviation ``sigma`` [m], for robot pose ``pose``
         (3,)."""
         return cls(_from_robot(pose, point), sigma)
 

@@ -107,7 +107,7 @@ def linearize_each(model: Array, poses: Array, points: Array, ranges: Array, bea
 
 @compiled
 def _widen(error: Array, jacobian: Array, uu: float, uv: float, vv: float) -> None:
-    """Whiten the ``error`` (2,) and ``jacobian`` (2, WIDTH) of a landmark by a covariance [[uu, uv], [uv, vv]], in
+    """Whiten ``error`` (2,) and ``jacobian`` (2, WIDTH) of a landmark by a covariance [[uu, uv], [uv, vv]], in
     place."""
     # [[p, 0], [r, q]] is the inverse of the lower Cholesky root of the covariance
     p = 1.0 / math.sqrt(uu)

@@ -24,7 +24,7 @@ def slopes(error: Array, jacobian: Array, ranges: Array, bearings: Array, out: A
 
 @compiled
 def loss(model: Array, error: Array, slopes: Array) -> float:
-    """Return the sum of the losses of K landmarks. ``model`` (14,): the array ``packed`` of a
+    """Return the sum of the robust losses of K landmarks. ``model`` (14,): the array ``packed`` of a
     :class:`~factors.landmarks.model.BearingRangeModel`. ``error`` (K, 2): the whitened residuals. ``slopes`` (K,): the
     output of :func:`slopes`."""
     total = 0.0

@@ -155,8 +155,7 @@ def with_late(model: BearingRangeModel, late: LateRanges) -> BearingRangeModel:
 
 
 def _constants(model: BearingRangeModel, parameters: Array) -> Array:
-    """Return the constants (..., 5) of a model after corrections ``parameters`` (..., 6), ordered as
-    :data:`PARAMETERS`."""
+    """Return the constants (..., 5) of a model after corrections ``parameters`` (..., 6) of :data:`PARAMETERS`."""
     x, y, _ = model.mounting
     out: Array = (
         np.array((x, y, model.bearing_bias, model.range_scale, model.depth_axis)) + parameters[..., :TIME_OFFSET]

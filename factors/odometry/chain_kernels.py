@@ -211,8 +211,8 @@ def _turn_by_gyro(rows: Array, knots: Array, i: int, constants: Array) -> None:
 def move(knot: Array, duration: float, lag: float, hold: float, slipping: float, out: Array) -> None:
     """Predict the integrated state ``knot`` by ``duration`` seconds, and write the new state into ``out``.
 
-    The velocity converges to the commanded velocity with the time constant ``lag`` [s], and continues for at most
-    ``hold`` seconds. The motion after that is unknown. If ``slipping`` is 1, all motion is unknown.
+    The velocity converges to that of the last odometry row with the time constant ``lag`` [s], and continues for at
+    most ``hold`` seconds. The motion after that is unknown. If ``slipping`` is 1, all motion is unknown.
     """
     ux, uy, uw = knot[_UX], knot[_UY], knot[_UW]
     moving = min(duration, hold)

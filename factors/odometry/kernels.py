@@ -174,8 +174,8 @@ def predicted(
 
 @compiled(inline="always")
 def _widen(covariance: Array) -> None:
-    """Increase the variances of the position in a covariance (3, 3) if they exceed :data:`FAR`, so that the covariance
-    stays invertible."""
+    """Increase the variances of the position in a covariance (3, 3) very slightly if they exceed :data:`FAR`. Rounding
+    then does not make it singular."""
     variance = covariance[0, 0] + covariance[1, 1]
     if variance > FAR:
         covariance[0, 0] += ROUNDING * variance

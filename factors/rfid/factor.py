@@ -108,7 +108,7 @@ class RfidFactor:
         return replace(self, likelihood=self.likelihood.adjusted(self._parameters(values)), estimated=())
 
     def _parameters(self, values: Array) -> Array:
-        """Return all parameters (..., Q): ``values`` (..., P) of the estimated ones, and zeros."""
+        """Return all parameters (..., Q): ``values`` (..., P) of the estimated parameters, and zeros for the others."""
         assert isinstance(self.likelihood, RfidLikelihood)
         out = np.zeros((*values.shape[:-1], len(self.likelihood.parameters)))
         out[..., list(self.estimated)] = values

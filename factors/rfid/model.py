@@ -178,8 +178,8 @@ class Packed(NamedTuple):
 @dataclass(frozen=True)
 class RfidModel:
     """All antennas and their detection models. ``false_read``: the read probability of a tag out of range. ``miss``:
-    one minus the read probability of the best placed tag. ``tempering``: exponent of the likelihood, below 1 if reads
-    are correlated. ``fixed``: True if antennas are fixed in the world, and the tags are on the robot."""
+    the probability of a miss where a model predicts a certain read. ``tempering``: exponent of the likelihood, below 1
+    if reads are correlated. ``fixed``: True if antennas are fixed in the world, and the tags are on the robot."""
 
     antennas: tuple[Antenna, ...]
     models: tuple[DetectionModel, ...]

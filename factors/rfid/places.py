@@ -68,12 +68,12 @@ class MissTable(NamedTuple):
 
 
 class Scan(NamedTuple):
-    """The reads for one evaluation of the likelihood. W tags are exceptional: they were read or have unusual odds.
+    """The reads for one evaluation of the likelihood. W tags are listed: they were read or have unusual odds.
 
     ``antennas`` (K,), ``rounds`` (K,): antenna and number of rounds of each measurement. ``hits`` (K, W): the number of
-    reads of each exceptional tag. ``number`` (T,): for each tag, in the order of the spatial index, its number among
-    the exceptional tags, or -1. ``odds`` (W,), ``elsewhere`` (W,), ``unlisted_odds``: as in
-    :class:`~factors.rfid.detection.TagReadCounts`, with the exceptional tags listed.
+    reads of each listed tag. ``number`` (T,): for each tag of the map, in the order of the spatial index, its number
+    among the listed tags, or -1. ``odds`` (W,), ``elsewhere`` (W,), ``unlisted_odds``: as in
+    :class:`~factors.rfid.detection.TagReadCounts`.
     """
 
     antennas: Integers
@@ -108,7 +108,7 @@ def is_wide(poses: Array, reach: float) -> bool:
 
 
 def in_reach(points: Array, reach: float) -> float:
-    """Return the mean number of tags at ``points`` (T, 2) within ``reach`` [m] of a point in their bounding box."""
+    """Return the mean number of ``points`` (T, 2) within ``reach`` [m] of a random point in their bounding box."""
     if not len(points):
         return 0.0
     area = float(np.prod(np.ptp(points, axis=0) + 2.0 * reach))
@@ -199,7 +199,7 @@ class Places:
         return out
 
     def _missed(self, scan: Scan, tempering: float) -> MissTable:
-        """The table of misses for tags that are not exceptional. The last table is cached for similar scans."""
+        """Return the table of misses for tags that are not listed in the scan. It is cached for similar scans."""
         key = (scan.antennas.tobytes(), scan.rounds.tobytes(), scan.unlisted_odds, tempering)
         if key not in self._last:
             self._last.clear()
@@ -207,7 +207,7 @@ class Places:
         return self._last[key]
 
     def _scan(self, counts: Counts) -> Scan:
-        """Convert counts to a :class:`Scan`, with the tags that were read or have other odds than most tags."""
+        """Return counts as a :class:`Scan` that lists the tags that were read or have other odds than most tags."""
         _, antennas, rounds, hits, odds, elsewhere, listed, unlisted_odds, _ = counts
         rows = np.arange(len(odds))
         if len(odds) == len(self.points) > 0:
@@ -282,8 +282,8 @@ def _of_tag(
     """Return the untempered log-likelihood of one tag that is as in the map, minus that of a tag out of reach that is
     never read.
 
-    ``x``, ``y``, ``height``, ``nx``, ``ny``: position and facing of the tag in the robot frame. ``levels`` (A,): the
-    numbers of the tag's tables. ``w``: the tag's number among the exceptional tags, or -1 if it was not read.
+    ``x``, ``y``, ``height``, ``nx``, ``ny``: position and front of the tag in the robot frame. ``levels`` (A,): the
+    numbers of the tag's tables. ``w``: the tag's number among the listed tags of the scan, or -1 if it is not listed.
     """
     packed, own = model.packed, 0.0
     for k in range(len(scan.antennas)):
@@ -305,7 +305,7 @@ def _of_tag(
 
 @compiled(error_model="numpy", fastmath=FAST)
 def _far(tables: RobotTables, scan: Scan, tempering: float) -> Array:
-    """Return the tempered log-likelihood (W,) of the reads of each exceptional tag if the tag is out of reach. It is
+    """Return the tempered log-likelihood (W,) of the reads of each listed tag of the scan if it is out of reach. It is
     relative to the log-likelihood of no reads."""
     out = np.empty(len(scan.odds))
     for w in range(len(out)):

@@ -330,7 +330,7 @@ def _features(
 ) -> tuple[float, float, float, float, float]:
     """Return the vector (x, y) from an antenna to a tag, their distance d, and w and c of :data:`FEATURES`.
     ``at``: from :func:`_mounted`. ``height``: height of the tag above the antenna. ``up``: vertical part of the
-    boresight. (``ex``, ``ey``), (``nx``, ``ny``): position and facing of the tag in the frame of the reference pose."""
+    boresight. (``ex``, ``ey``), (``nx``, ``ny``): position and front of the tag in the frame of the reference pose."""
     ex, ey = ex - at[0], ey - at[1]
     d = math.sqrt(ex * ex + ey * ey + height * height + NEAR * NEAR)
     return ex, ey, d, 1.0 - (ex * at[2] + ey * at[3] + height * up) / d, -(nx * ex + ny * ey) / d
@@ -340,7 +340,7 @@ def _features(
 def _all_features(
     antennas: Array, points: Array, normals: Array, pose: Array, offsets: Array, which: Integers, tags: Integers
 ) -> Array:
-    """The compiled part of :func:`features`, with the same result."""
+    """Compute :func:`features` in compiled code, with the same result."""
     out, c0, s0 = np.empty((len(tags), 6)), math.cos(pose[2]), math.sin(pose[2])
     for r in range(len(tags)):
         antenna, point, normal = antennas[which[r]], points[tags[r]], normals[tags[r]]

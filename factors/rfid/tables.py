@@ -122,7 +122,7 @@ def make_tables(model: RfidModel, packed: Packed, heights: Array) -> Tables:
 
 
 def _blocks(table: NDArray[np.uint16]) -> NDArray[np.uint16]:
-    """Return the largest element, over all facings, in each block of a table (F, NX, NX)."""
+    """Return the largest element, over all directions of the tag's front, in each block of a table (F, NX, NX)."""
     begins = np.arange(0, table.shape[1], COARSE)
     highest = np.maximum.reduceat(table.max(axis=0), begins, axis=0)
     return np.asarray(np.maximum.reduceat(highest, begins, axis=1))

@@ -135,8 +135,8 @@ class TagStates:
             self.last_read = max(self.last_read, t)
 
     def expect(self, tags: Integers, evidence: Array) -> Array:
-        """Return the log-likelihood (U,) of a scan for ``tags`` (U,), under the condition that each is weak, moved or
-        dead. This is the field ``elsewhere`` of :class:`~factors.rfid.detection.TagReadCounts`.
+        """Return the log-likelihood (U,) of the reads and misses of ``tags`` (U,) in one scan, given that each tag is
+        weak, moved or dead. This is the field ``elsewhere`` of :class:`~factors.rfid.detection.TagReadCounts`.
 
         ``evidence`` (U, S): the log-likelihood of each tag's reads and misses for each of the ``hypotheses``, relative
         to the log-likelihood that a tag out of range is never read.
@@ -164,7 +164,8 @@ class TagStates:
         self._evidence = kept
 
     def _add(self, tags: Integers, evidence: NDArray[np.float32], sign: float) -> None:
-        """Add (``sign`` 1) or remove (``sign`` -1) the evidence of a scan on ``tags``."""
+        """Add (``sign`` 1) or remove (``sign`` -1) the ``evidence`` (U, S) of a scan on ``tags`` (U,), see
+        :meth:`expect`."""
         if _learn(self._weights, self.odds, tags, evidence, sign):
             self._doubtful = None
         self._raise_prior()
@@ -281,7 +282,7 @@ def _odds(weights: Array) -> float:
 
 @compiled
 def _expected(weights: Array, tags: Integers, evidence: Array) -> Array:
-    """Compute :meth:`TagStates.expect`."""
+    """Compute :meth:`TagStates.expect` from the log-probabilities ``weights`` (T, W) of the states of all tags."""
     out, added = np.empty(len(tags)), np.zeros(weights.shape[1] - DEAD)
     for u in range(len(tags)):
         unsurveyed = weights[tags[u], DEAD:]
@@ -294,7 +295,8 @@ def _expected(weights: Array, tags: Integers, evidence: Array) -> Array:
 
 @compiled
 def _hear(weights: Array, odds: Array, tags: Integers) -> bool:
-    """Exclude the state dead of ``tags``. Returns True if a tag is no longer believed to be weak, moved or dead."""
+    """Exclude the state dead of ``tags``, in place. Returns True if a tag is no longer believed to be weak, moved or
+    dead. ``weights`` (T, W), ``odds`` (T,): log-probabilities of the states, and log-odds, of all tags."""
     changed = False
     for t in tags:
         if weights[t, DEAD] > -np.inf:
@@ -306,8 +308,8 @@ def _hear(weights: Array, odds: Array, tags: Integers) -> bool:
 
 @compiled
 def _learn(weights: Array, odds: Array, tags: Integers, evidence: NDArray[np.float32], sign: float) -> bool:
-    """Add ``sign`` times the log-likelihoods ``evidence`` to the weights of ``tags``. Returns True if this changes
-    which tags are believed to be weak, moved or dead."""
+    """Add ``sign`` times ``evidence`` (U, S) to the log-probabilities ``weights`` (T, W) of ``tags`` (U,), and update
+    ``odds`` (T,). Returns True if this changes which tags are believed to be weak, moved or dead."""
     changed = False
     for u in range(len(tags)):
         of_tag, old_odds = weights[tags[u]], odds[tags[u]]

@@ -283,8 +283,7 @@ def _floored(packed: Packed, rate: float, chance: float) -> float:
 
 @compiled(fastmath=True)
 def _add_logs(values: Array, count: int, out: Array) -> None:
-    """Add the logarithms of ``values`` (N,) > 0 to ``out`` (N,), with an error of at most 1e-10. Sets ``values`` to
-    1."""
+    """Add the logarithms of ``values`` (N,) > 0 to ``out`` (N,), with an error below 1e-10. Sets ``values`` to 1."""
     room = np.empty(count)
     bits, mantissas = values.view(np.int64), room.view(np.int64)
     for n in range(count):
