@@ -239,8 +239,8 @@ class Ekf(Filter):
         ((self._odometry, self._step, self._state, _),) = self._predictions((t,))
 
     def _predictions(self, times: Sequence[float]) -> list[tuple[ChainState, _Step, _State, Array]]:
-        """Predict the state to each of ``times`` [s] in turn. Returns four values for each time: the integrated odometry, the
-        step from the previous time, the predicted state, and the covariance (3, 3) of (x, y, heading) in the world frame."""
+        """Return predictions of the state to each of ``times`` [s] in turn. Each is a tuple: the integrated odometry,
+        the step from the previous time, the predicted state, and the pose's covariance (3, 3) in the world frame."""
         s = self._state
         part = s.layout.columns.get(MOTION, NOWHERE)
         constants = s.rest[part.start - POSE : part.stop - POSE]

@@ -133,7 +133,8 @@ class Filter(Timeline):
         return Learnt()
 
     def forget(self, until: float) -> None:
-        """Delete the trajectory before the time ``until`` [s], except for the part that late measurements can still change."""
+        """Delete the trajectory before the time ``until`` [s], except for the part that late measurements can still
+        change."""
         self._ahead = None
         t = min(until, self._t - self._max_delay)
         records = max(0, bisect.bisect_left(self._records, t, key=lambda record: record.t) - 1)
@@ -175,8 +176,7 @@ class Filter(Timeline):
         """Return the data of the present state that :meth:`trajectory` needs, with an attribute ``t``, the time [s]."""
 
     def _seek(self, m: Any) -> Any:
-        """Search the start pose with the measurement ``m``. Returns the first state, or None if the pose is still
-        unknown."""
+        """Return the first state, determined with the measurement ``m``, or None if the pose is still unknown."""
         return None
 
     def _estimate_at(self, t: float | None) -> PoseEstimate:

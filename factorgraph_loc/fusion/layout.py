@@ -58,7 +58,7 @@ def constants_of(motion: Motion, sensors: Mapping[str, Sensor]) -> dict[str, Est
 
 
 def on_pose(observation: Observation, view: View) -> Observation:
-    """Convert an observation to one that depends on the pose only. Sensor constants and landmarks are fixed at their
+    """Return an observation as a function of the pose only. Sensor constants and landmarks are fixed at their
     estimates, and their covariances are added to the noise. ``view``: gives access to the estimates."""
     values = {name: np.asarray(view.value(name)) for name in observation.blocks}
     return observation.on_pose(values, {name: view.block_covariance(name) for name in observation.blocks})

@@ -206,7 +206,7 @@ class ParticleFilter(Filter):
         return self._sampled_cloud(self._t) if self._search.look(m, self._odometry) else None
 
     def _sampled_cloud(self, since: float) -> Cloud | None:
-        """Draw particles from the result of the global search. Returns None if there is no result yet.
+        """Return particles drawn from the result of the global search, or None if there is no result yet.
 
         If the search has found one clear pose, the filter is then localized, and sensors restart at the time ``since``
         [s]. If the filter was localized before ``since``, the sensor constants from that time are used again.
@@ -268,8 +268,8 @@ class ParticleFilter(Filter):
         return poses[0], worlds[0]
 
     def _moved(self, cloud: Cloud, increment: Increment, noise: Array | None = None) -> tuple[Array, Array]:
-        """Move the particles of ``cloud`` by an odometry increment, with their own constants and body-frame ``noise``.
-        Returns the poses (N, 3), and the Jacobian (3, 3+P) of the pose by body-frame perturbation and constants."""
+        """Return poses (N, 3) of ``cloud`` moved by odometry, with the particles' own constants and body-frame
+        ``noise``. Also returns the Jacobian (3, 3+P) of the pose by body-frame perturbation and constants."""
         by_constants = np.zeros((3, cloud.constants.shape[1]))
         delta = increment.delta
         part = cloud.parts.get(MOTION)

@@ -100,7 +100,7 @@ class BackwardSimulation:
         return _moments(poses, extra)
 
     def _step(self, cloud: Cloud, increment: Increment, later: Cloud) -> tuple[Cloud, Array]:
-        """Draw an ancestor from ``cloud`` for each of the M later states ``later``. Returns the ancestors, and the
+        """Return an ancestor from ``cloud`` for each of the M later states ``later``, drawn at random. Also returns the
         differences (M, 3) between their motions and the odometry. ``increment``: the odometry in between."""
         smooth, kernel = cloud.density()
         # without constants that were added later
@@ -156,15 +156,13 @@ def draw_ancestors(
     covariance: Array,
     uniform: Array,
 ) -> Integers:
-    """Draw an ancestor among N particles for each of M later states (Godsill et al., 2004, eq. 7). The probability of
-    an ancestor is proportional to its weight times the transition density to the later state.
+    """Return the index (M,) of a random ancestor among N particles for each of M later states. Its probability is
+    proportional to its weight times the transition density to the later state (Godsill et al., 2004, eq. 7).
 
     ``predicted`` (N, 3): the particles' poses after the motion, without noise. ``constants`` (N, P): the particles'
     sensor constants. ``log_weights`` (N,): their log-weights. ``later`` (M, 3), ``later_constants`` (M, P): poses and
     constants of the later states. ``covariance`` (3+P, 3+P): the covariance of the transition, of the body-frame pose
     error and of the constants. ``uniform`` (M,): random numbers from [0, 1).
-
-    Returns the indices (M,) of the ancestors.
     """
     size = constants.shape[1]
     # constants first, so that their part of the whitened states can be computed before the loop over all pairs

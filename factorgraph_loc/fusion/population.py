@@ -270,7 +270,7 @@ class Population:
         return np.full(count, self._volume / float(np.prod(kld.CELL)) / count if self._start is None else 0.0)
 
     def _draw_anywhere(self, count: int, now: ChainState) -> Array:
-        """Draw ``count`` poses (N, 3) without regard to observations.
+        """Return ``count`` random poses (count, 3) that do not depend on observations.
 
         If the start position is known, they are drawn around it and moved by odometry to ``now``. Otherwise they are
         uniform over the free space or, if that is unknown, over the bounds (as a Latin hypercube).

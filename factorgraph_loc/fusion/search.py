@@ -88,7 +88,8 @@ class Search:
             self._population = self._new_population(start)
 
     def look(self, m: Any, odometry: ChainState) -> bool:
-        """Process the measurement ``m`` while the pose is unknown. Returns True if the result may have changed.
+        """Process the measurement ``m`` while the pose is unknown. Returns True if the result of the search may have
+        changed.
 
         The result changes if the measurement is informative, or if the particles have processed an observation
         completely. ``odometry``: the integrated odometry at the time of the measurement.

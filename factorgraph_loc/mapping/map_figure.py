@@ -22,7 +22,7 @@ LABEL = 4  # last characters of a tag's EPC that are shown
 
 
 def tag_figure(log: str, made: MadeTags) -> Figure:
-    """Plot a new map of tags, with the given map and the trajectory. Returns the figure.
+    """Return a plot of a new map of tags, with the given map and the trajectory.
 
     The plot also has the candidate positions of ambiguous tags, and the given tags that were not located. Labels are
     the last characters of EPCs. ``log``: the name of the log. ``made``: the new map.
@@ -49,7 +49,7 @@ def dropped_figure(
     poses: Array,
     walls: Sequence[tuple[float, ...]] = (),
 ) -> Figure:
-    """Plot a map of tags with crosses over tags that are probably dead. Returns the figure.
+    """Return a plot of a map of tags with crosses over tags that are probably dead.
 
     ``places``: the position (2,) of each tag by EPC. ``dead``: the EPCs of the dead tags, with the probability that the
     tag is dead. ``poses`` (N, 3): the trajectory. ``walls``: (x1, y1, x2, y2) of each wall.
@@ -67,7 +67,7 @@ def dropped_figure(
 
 
 def figure(log: str, made: LandmarkMap, poses: Array, label: int = 0) -> Figure:
-    """Plot a new map of landmarks with 2-sigma ellipses, the given map and the trajectory. Returns the figure.
+    """Return a plot of a new map of landmarks with 2-sigma ellipses, the given map and the trajectory.
 
     ``log``: the name of the log. ``made``: the new map. ``poses`` (N, 3): the trajectory in its frame. ``label``:
     landmarks are labelled with this many last characters of their name, or with the whole name if it is 0.
@@ -97,7 +97,7 @@ def figure(log: str, made: LandmarkMap, poses: Array, label: int = 0) -> Figure:
 
 
 def point_figure(log: str, points: PointMap, cameras: Array, walls: Sequence[tuple[float, ...]] = ()) -> Figure:
-    """Plot a map of points from above, coloured by height. Returns the figure.
+    """Return a plot of a map of points from above, coloured by height.
 
     ``log``: the name of the log. ``cameras`` (F, 3): the camera positions. ``walls``: (x1, y1, x2, y2) of each wall.
     """

@@ -107,8 +107,8 @@ def _best(likelihood: PhaseLikelihood, reads: PhaseReads, start: Array, informat
 def _refined(
     likelihood: PhaseLikelihood, reads: PhaseReads, start: Array, information: Array, off: Array
 ) -> tuple[Array, Array]:
-    """Maximise the posterior density by Fisher scoring, starting at the displacement ``off`` (2,). Returns the optimal
-    displacement (2,) and its information matrix (2, 2). ``start``, ``information``: see :func:`_best`."""
+    """Return the displacement (2,) of a tag with the largest posterior density, and its information matrix (2, 2).
+    Fisher scoring starts at the displacement ``off`` (2,). ``start``, ``information``: see :func:`_best`."""
 
     def at(off: Array) -> tuple[float, Array, Array]:
         score, moved = likelihood.score(np.array((*-off, 0.0)), reads), off + start

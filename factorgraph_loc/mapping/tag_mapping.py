@@ -118,10 +118,10 @@ def map_tags(
 def _along_reference(
     log: Log, observations: TagObservations
 ) -> tuple[dict[int, LearntPoint], Array, list[TagPosterior], Array]:
-    """Locate T tags along the log's reference.
+    """Return the positions, by index, of those of T tags that can be located along the log's reference.
 
-    Returns the positions of located tags by index, and the directions (T,) [rad] of all tags' fronts. Also returns the
-    search results of all tags, and the robot poses (K, 3) at the antenna observations.
+    Also returns the directions (T,) [rad] of all tags' fronts and the search results of all tags. The last value is the
+    robot poses (K, 3) at the antenna observations.
     """
     if log.reference is None:
         raise InputError(f"{log.name}: has no reference: map its tags with --poses odometry")

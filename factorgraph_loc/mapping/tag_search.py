@@ -108,7 +108,7 @@ class TagPosterior:
 
 
 def search(model: RfidModel, counts: TagReadCounts, heights: Array, facing: Array) -> list[TagPosterior]:
-    """Search for the positions of T tags. Returns one result per tag.
+    """Return one search result for the position of each of T tags.
 
     ``counts``: the reads of these tags, with the robot poses in the world frame as ``offsets``. ``heights`` (T,) [m]:
     of the tags. ``facing`` (T,) [rad]: the directions of the tags' fronts, NaN if unknown.
@@ -313,9 +313,10 @@ def reach(model: RfidModel) -> float:
 def refine(
     model: RfidModel, counts: TagReadCounts, heights: Array, candidates: TagCandidates
 ) -> tuple[TagCandidates, Array, Array]:
-    """Move C candidates to the nearest local optimum of the likelihood. ``counts``, ``heights``: see :func:`search`.
+    """Return C candidates, moved to the nearest local optimum of the likelihood. ``counts``, ``heights``: see
+    :func:`search`.
 
-    Returns the moved candidates, their negative log-likelihoods (C,) and covariances (C, 2, 2).
+    Also returns their negative log-likelihoods (C,) and covariances (C, 2, 2).
     """
     places, nll = candidates.places.copy(), np.empty(len(candidates.tag))
     covariances = np.empty((len(nll), 2, 2))
@@ -332,11 +333,12 @@ def refine(
 def _refined(
     model: RfidModel, counts: TagReadCounts, heights: Array, facing: Array, places: Array
 ) -> tuple[Array, Array, Array]:
-    """Move C candidates to the nearest local optimum. Column c of ``counts.hits`` has the reads of candidate c.
+    """Return positions (C, 2) of C candidates, moved to the nearest local optimum. Column c of ``counts.hits`` has the
+    reads of candidate c.
 
-    ``heights``, ``facing`` (C,), ``places`` (C, 2): of the candidates. Returns positions (C, 2), negative
-    log-likelihoods (C,) and information matrices (C, 2, 2). The information is the observed curvature if it is positive
-    definite, otherwise the Fisher information.
+    ``heights``, ``facing`` (C,), ``places`` (C, 2): of the candidates. Also returns negative log-likelihoods (C,) and
+    information matrices (C, 2, 2). The information is the observed curvature if it is positive definite, otherwise the
+    Fisher information.
     """
 
     def at(places: Array, which: Integers) -> tuple[Array, Array, Array]:

@@ -217,7 +217,8 @@ class _Problem:
         self._count = max(self._count, count)
 
     def search(self, wanted: NDArray[np.bool_], first: int) -> list[TagPosterior]:
-        """Search for tags along the current poses. Returns a result for each of T tags, which is empty for tags not searched.
+        """Return a search result for each of T tags along the current poses. It is empty for tags that are not
+        searched.
 
         ``wanted`` (T,): mask of the tags to search. ``first``: the first keyframe whose observations are used.
         """

@@ -115,8 +115,8 @@ def reproject(model: CameraModel, cameras: Cameras, points: Array, tracks: Track
 
 
 def triangulate(model: CameraModel, cameras: Cameras, tracks: Tracks) -> Triangulated:
-    """Triangulate the points of ``tracks`` for exact camera poses (:mod:`factors.camera.triangulation_kernels`).
-    Returns their positions, covariances and residuals.
+    """Return the points of ``tracks``, triangulated for exact camera poses by
+    :mod:`factors.camera.triangulation_kernels`.
 
     The parallax of a point is set to 0 if its rays do not determine it.
     """

@@ -41,7 +41,8 @@ class Diagnostics:
     added: list[Addition] | None = field(default=None, init=False, repr=False, compare=False)
 
     def __str__(self) -> str:
-        """A summary: updates of each sensor, with their mean normalised innovation squared (NIS), counts, and events.
+        """Return a summary: updates of each sensor, with their mean normalised innovation squared (NIS), counts, and
+        events.
 
         The mean NIS is ideally 1 per degree of freedom.
         """

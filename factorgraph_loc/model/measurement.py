@@ -189,7 +189,7 @@ def selected(stream: S, keep: NDArray[np.bool_]) -> S:
 
 
 def are_alike(first: Stream, second: Stream) -> bool:
-    """True if two streams have the same class."""
+    """Return True if two streams have the same class."""
     return type(first) is type(second)
 
 

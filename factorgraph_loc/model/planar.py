@@ -79,7 +79,7 @@ class Turned(FileModel):
     """orientation of the measured frame on the robot"""
 
     def is_given(self) -> bool:
-        """True if axes or mounting are set."""
+        """Return True if axes or mounting are set."""
         return self.axes is not None or self.mounting != Mounting()
 
     def standing(self) -> Array:

@@ -65,7 +65,7 @@ class Exchange:
     @classmethod
     @abstractmethod
     def _columns(cls) -> tuple[str, ...]:
-        """The names of the columns of :meth:`to_numpy`."""
+        """Return the names of the columns of :meth:`to_numpy`."""
 
     @classmethod
     @abstractmethod

@@ -15,7 +15,7 @@ from factorgraph_loc.text import plain
 
 @dataclass(frozen=True)
 class Section:
-    """A section of a rig.
+    """A section of a rig. Classes are given as text ``package.module:name``.
 
     ``kind``: the class of its settings, a :class:`~factorgraph_loc.files.models.FileModel`. ``always``: True if a rig
     without the section gets the default settings. ``several``: True if a rig may have several such sensors, each in a
@@ -30,7 +30,8 @@ class Section:
 
 @dataclass(frozen=True)
 class Layer:
-    """A layer of a map: elements of one class by name, such as RFID tags.
+    """A layer of a map: elements of one class by name, such as RFID tags. All fields except ``suffix`` are texts
+    ``package.module:name``.
 
     ``kind``: the class of an element, a :class:`~factorgraph_loc.files.models.FileModel`. ``table``: the description of
     a table with many elements. ``read``: a function ``(content, source, folder) -> elements``. It converts the value in

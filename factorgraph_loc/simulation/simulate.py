@@ -62,7 +62,8 @@ def generator(seed: int | Any, name: str, names: tuple[str, ...] = NAMES) -> np.
 
 
 def drive(world: World, settings: DriveSettings, rng: np.random.Generator) -> Trajectory:
-    """Simulate a robot that drives between random places of a world. Returns its poses at ``settings.rate``, starting at t = 0.
+    """Return the poses of a simulated robot that drives between random places of a world. Their rate is
+    ``settings.rate``, and they start at t = 0.
 
     Raises InputError if the world has no room to drive in.
     """
@@ -87,9 +88,10 @@ def drive(world: World, settings: DriveSettings, rng: np.random.Generator) -> Tr
 
 
 def _follow(path: Array, heading: float, settings: DriveSettings) -> Trajectory:
-    """Follow a path (N, 2) by pure pursuit: turn towards a point ahead on the path, and slow down if the heading error is large.
+    """Return the poses of a robot that follows a ``path`` (N, 2) by pure pursuit. It turns towards a point ahead on the
+    path, and slows down if the heading error is large.
 
-    ``heading`` [rad]: the heading at the start. Returns the driven poses.
+    ``heading`` [rad]: the heading at the start.
     """
     every = max(1, round(1.0 / (settings.rate * STEP)))
     step = 1.0 / (settings.rate * every)

@@ -222,10 +222,12 @@ def _antennas(plan: Plan, walls: Array, settings: WorldSettings, rng: np.random.
 
 
 def _distribute(plan: Plan, faces: Array, count: int, rng: np.random.Generator) -> Array:
-    """Distribute ``count`` places over ``faces`` (F, 4). Returns (count, 3): x, y, and the direction away from the face.
+    """Return ``count`` positions distributed over ``faces`` (F, 4), as (count, 3): x, y, and the direction away from
+    the face.
 
-    For each place, :data:`CANDIDATES` places are drawn uniformly along the faces. The one farthest from the previous
-    places is chosen (best-candidate sampling: Mitchell, SIGGRAPH 1991). Places behind furniture are not chosen.
+    For each position, :data:`CANDIDATES` positions are drawn uniformly along the faces. The one farthest from the
+    previous positions is chosen (best-candidate sampling: Mitchell, SIGGRAPH 1991). Positions behind furniture are not
+    chosen.
     """
     out = np.empty((count, 3))
     length = np.hypot(faces[:, 2] - faces[:, 0], faces[:, 3] - faces[:, 1])

@@ -52,8 +52,8 @@ def bundled(
     poses: Sequence[Array],
     waiting: Waiting,
 ) -> list[tuple[Array, Array]] | None:
-    """Bundle adjustment of the last keyframes and their points. Returns a list of (pose (3,), tilt (2,)), one per
-    adjusted keyframe.
+    """Return a list of (pose (3,), tilt (2,)), one per adjusted keyframe, from a bundle adjustment of keyframes and
+    points.
 
     ``keyframes``: consecutive keyframes. The newest keyframes are adjusted, as long as each shares enough points with
     its predecessor. The first adjusted pose is fixed. ``poses``: the initial poses of all ``keyframes``. ``waiting``:

@@ -95,7 +95,7 @@ class LoopClosure:
     def compare(
         self, model: CameraModel, image: Image, old: OldPoints, current: Callable[[int], Array]
     ) -> Revisit | None:
-        """Compare an image with ``old`` points. Returns the recognized points and the pose, None if no loop is closed.
+        """Return the recognized ``old`` points and the pose if ``image`` closes a loop, otherwise None.
 
         A loop is closed if the last :data:`SUCCESSIVE` images show old points from consistent poses. ``current``: a
         function that returns the newest estimate of a variable of the graph, by key.

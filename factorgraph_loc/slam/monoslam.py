@@ -324,8 +324,8 @@ class Monoslam(Filter):
         return SlamState(robot, lost_state.constants, covariance, floor=lost_state.floor)
 
     def _managed(self, m: Pixels, state: SlamState, eye: Eye, match: Match) -> SlamState:
-        """Update the points of the state after an image: count matches, add new points, delete bad points, and convert
-        points of known depth to x, y, z. Returns the new state."""
+        """Return the state with updated points after an image. Matches are counted, and bad points are deleted. New
+        points are added, and points of known depth are converted to x, y, z."""
         state = counted(state, match.expected, frozenset(match.mapped), m.t)
         frame = m.frame
         wanted = min(self._settings.per_image, self._settings.max_points)

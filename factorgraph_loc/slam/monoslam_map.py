@@ -76,10 +76,10 @@ def counted(state: SlamState, expected: Sequence[int], matched: Collection[int],
 
 
 def pruned(state: SlamState, most: int) -> tuple[SlamState, int]:
-    """Delete points that are often not matched, and points with a negative inverse depth.
+    """Return the state without points that are often not matched, and without points of negative inverse depth.
 
-    Returns the new state and the number of these points. If more than ``most`` points remain, the points with the
-    oldest matches are deleted too, but not counted.
+    Also returns the number of these deleted points. If more than ``most`` points remain, the points with the oldest
+    matches are deleted too, but not counted.
     """
     failed = {
         i

@@ -82,12 +82,12 @@ class MovingThings:
 
 
 def another(model: CameraModel, first: Array, second: Array, step: Increment, right: Truths) -> Truths:
-    """Search a second rotation that explains the feature tracks that disagree with the odometry. Returns a mask (K,) of
-    the tracks that fit this rotation.
+    """Return a mask (K,) of the feature tracks that fit a second rotation of the robot. This rotation must explain the
+    tracks that disagree with the odometry.
 
     ``first``, ``second`` (K, 2): the pixels of K tracks in two images. ``step``: the motion of the odometry between the
-    images. ``right`` (K,): mask of the tracks that agree with ``step``. The result is False everywhere if most tracks
-    agree with ``step``, or if no rotation explains the fraction :data:`EXPLAINED` of the disagreeing tracks.
+    images. ``right`` (K,): mask of the tracks that agree with ``step``. The mask is False everywhere if most tracks
+    agree with ``step``, or if no rotation explains the fraction :data:`EXPLAINED` of the others.
     """
     best, unexplained = right, ~right
     if 2 * np.count_nonzero(unexplained) >= len(right):

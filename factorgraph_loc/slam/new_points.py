@@ -162,7 +162,7 @@ def has_parallax(
 def agreed(
     model: CameraModel, sightings: Sequence[PointSighting], places: Sequence[KeyframeCamera]
 ) -> tuple[TriangulatedPoint, list[PointSighting]] | None:
-    """Triangulate a point without outliers. Returns the point and its consistent observations.
+    """Return a triangulated point and its consistent observations, without outliers.
 
     ``places``: the camera pose of each observation. While the residuals are too large, the worst observation is
     removed. Returns None if the remaining observations do not determine the point.

@@ -80,8 +80,8 @@ class PointViews:
     def refound(
         self, camera: CameraPose, points: Sequence[int], positions: Array, frame: CameraFrame, rows: Sequence[int]
     ) -> list[tuple[int, int]]:
-        """Search points in an image after their tracks were lost. Returns pairs (index in ``points``, row of
-        ``frame``).
+        """Return pairs (index in ``points``, row of ``frame``) of points found again after their feature tracks were
+        lost.
 
         ``camera``: the predicted camera pose. ``points``: keys of N points. ``positions`` (N, 3): their estimates.
         ``rows``: the features of ``frame`` that may be matched.

@@ -126,7 +126,8 @@ class UnknownPoints(Mapper):
         return self._cameras.at_stamp(keyframe.index, (pose, guess[1]), graph)
 
     def _chosen(self, image: _NewImage, rows: Sequence[int], names: Sequence[Hashable]) -> ChosenSightings:
-        """Select some of the ``rows`` of the image, spread over the whole image. ``names``: the name of each row's point."""
+        """Return some of the ``rows`` of the image, spread over the whole image. ``names``: the name of each row's
+        point."""
         priority = [len(names) if name in self._points else self._new.count(name) for name in names]
         pixels = np.asarray(image.m.pixels[list(rows)], dtype=float)
         chosen = spread_out(pixels, PER_KEYFRAME + MOST_WAITING, priority).tolist()
@@ -219,7 +220,8 @@ class UnknownPoints(Mapper):
         self._names_by_track[track] = name
 
     def _revisited(self, image: _NewImage, guess: Guess, rows: Sequence[int], names: list[Hashable]) -> set[int]:
-        """Recognize points last observed long ago (loop closure). Returns their rows, and enters their names in ``names``."""
+        """Return the rows of points that were last observed long ago (loop closure). Their names are written into
+        ``names``."""
         frame, t, graph = image.m.frame, image.keyframe.t, image.graph
         if frame is None or not self._loops.is_due(image.m.t):
             return set()
@@ -318,8 +320,8 @@ class UnknownPoints(Mapper):
     def _corrected(
         self, image: _NewImage, points: list[_Point], pixels: Array, guess: Guess, known: Truths
     ) -> tuple[Guess, Array, float, Truths]:
-        """Correct the pose ``guess`` by ``points`` of the graph that are observed at ``pixels``. Returns pose, tilt
-        (2,) of the robot, prior standard deviation of the tilt, and a mask of the inliers.
+        """Return the pose ``guess``, corrected by ``points`` of the graph that are observed at ``pixels``. Also returns
+        the tilt (2,) of the robot, the prior standard deviation of the tilt, and a mask of the inliers.
 
         Recent points and old points are tested separately, because the pose has drifted since the old ones. If too few
         points agree, only recent ones with names are used. ``known``: mask of points recognized by a loop closure.

@@ -131,7 +131,7 @@ class Mapper:
     knows_scale: bool = True
 
     def is_due(self, m: Any) -> bool:
-        """True if a new keyframe is needed at the time of the measurement ``m``."""
+        """Return True if a new keyframe is needed at the time of the measurement ``m``."""
         return False
 
     def take(self, m: Any, keyframe: Keyframe, guess: Guess, graph: Graph, addition: Addition) -> Guess:

@@ -338,7 +338,7 @@ class Incremental:
 
 
 def _is_definite(covariance: Array) -> bool:
-    """True if a covariance (D, D) is finite and has a Cholesky root."""
+    """Return True if a covariance (D, D) is finite and has a Cholesky root."""
     if positive.is_clear(np.ascontiguousarray(covariance)):
         return True
     try:

@@ -133,7 +133,7 @@ class Builder:
         return True
 
     def _needs_keyframe(self, m: Measurement, sensor: Sensor) -> bool:
-        """True if a new keyframe is needed at the time of the measurement ``m`` of ``sensor``."""
+        """Return True if a new keyframe is needed at the time of the measurement ``m`` of ``sensor``."""
         since, interval = m.t - self._graph.newest.t, sensor.keyframe_every
         if not sensor.gathers and self._settings.landmarks != "known":
             interval = MAPPING_KEYFRAME_INTERVAL

@@ -153,7 +153,7 @@ class Chained:
         return bool(self._poses)
 
     def begin(self, values: Values) -> State | None:
-        """Convert ``values`` by key to a state: poses (N, 3), and all vectors joined to one array (P,). Returns None if
+        """Return ``values`` by key as a state: poses (N, 3), and all vectors joined to one array (P,). Returns None if
         P is too large."""
         ends = np.cumsum([0, *(len(values[key]) for key in self._vectors)]).tolist()
         if ends[-1] > MOST_PARAMETERS:
@@ -166,7 +166,7 @@ class Chained:
         return np.array([values[key] for key in self._poses]), parameters
 
     def values(self, state: State) -> Values:
-        """Convert a state from :meth:`begin` back to values by key."""
+        """Return the values of a state from :meth:`begin` by key."""
         poses, parameters = state
         vectors = {key: parameters[columns] for key, columns in self._columns.items()}
         return dict(zip(self._poses, poses, strict=True)) | vectors

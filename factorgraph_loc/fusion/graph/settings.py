@@ -22,8 +22,8 @@ class GraphSettings(FileModel):
 
 
 def _lag(value: Any, bounded: ValidatorFunctionWrapHandler) -> Any:
-    """Convert the value of the setting ``lag``: "all" to infinity, other values by the function ``bounded``, which
-    checks bounds."""
+    """Return infinity for the value "all" of the setting ``lag``, otherwise the value checked by the function
+    ``bounded``."""
     return math.inf if value in ("all", math.inf) else bounded(value)
 
 

@@ -48,7 +48,7 @@ class MarginalSummary:
         values = to_gtsam(at)
 
         def placed(factor: gtsam.LinearContainerFactor) -> gtsam.LinearContainerFactor:
-            """Convert a marginal factor from the linearisation points of iSAM2 to the linearisation points ``at``."""
+            """Return a marginal factor with the linearisation points ``at`` instead of those of iSAM2."""
             return gtsam.LinearContainerFactor(
                 gtsam.LinearContainerFactor(factor.factor(), points).linearize(values), values
             )
