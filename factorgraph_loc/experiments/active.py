@@ -105,9 +105,8 @@ def active(
 
     There is a run for each policy, estimator and seed. ``world``: a preset of
     :func:`~factorgraph_loc.api.logs.simulate`, a TOML file, or settings. ``out``: folder for the results.
-    ``overwrite``: replace existing results in ``out``. ``changes``: nested settings of robot, policy or world, such as
-    ``{"policy": {"horizon": 8}}``. ``jobs``: number of processes, None for one per core. ``progress``: called with the
-    numbers of finished and of all runs.
+    ``overwrite``: replace existing results. ``changes``: nested settings, such as ``{"policy": {"horizon": 8}}``.
+    ``jobs``: number of processes, None for one per core. ``progress``: called with numbers of finished and all runs.
 
     The files in ``out`` are ``results.parquet``, ``results.csv`` (a row for each run), ``differences.csv`` (see
     :func:`~factorgraph_loc.experiments.active_results.differences`), ``table.md``, ``config.toml`` and
