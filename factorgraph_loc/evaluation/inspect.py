@@ -44,8 +44,8 @@ class Inspection:
 
     @property
     def found(self) -> dict[str, Any]:
-        """The statistics of all sensors by key, such as ``unseen`` or ``rfid``. If a kind has several sensors, the key
-        is the name of a sensor, and the value is a dictionary of its statistics."""
+        """The statistics of all sensors by key, such as ``unseen`` or ``rfid``. If the rig has several sensors of a
+        kind, the key is the name of a sensor. The value is then a dictionary of its statistics."""
         entries: dict[str, Any] = {}
         for name, summary in self.sensors.items():
             entries |= summary.found if kind_of(name) == name else {name: dict(summary.found)}

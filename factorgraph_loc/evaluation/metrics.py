@@ -106,8 +106,8 @@ def score(result: RunResult, log: Log, align: Alignment = "none") -> dict[str, A
       ``scored`` are None.
     - ``time_to_localized`` [s]: time from the start of the run until the robot is localized.
     - ``landmarks.*``: see :func:`landmark_figures`; None unless the run estimated the map.
-    - ``learnt.NAME.value`` and ``learnt.NAME.sigma``: value and standard deviation of each estimated constant, such as
-      a wheel scale.
+    - ``learnt.NAME.value`` and ``learnt.NAME.sigma``: value and standard deviation of each estimated constant
+      of a sensor.
     - ``nis.SENSOR.*``, ``ignored.*``, ``rejected.*``, ``late.*``, ``timing.*``, and the list ``warnings`` always exist.
 
     ``align``: how to align the trajectories with the reference. If the run estimated its map, "none" becomes "se2".

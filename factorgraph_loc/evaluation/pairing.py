@@ -82,7 +82,7 @@ def pairs_in_space(estimate: PosePath, reference: PosePath, max_gap: float = MAX
 def pauses(t: Array) -> Integers:
     """Return the indices of the timestamps ``t`` (N,) [s] that follow a gap.
 
-    A gap is longer than 1 s and longer than three times the median interval.
+    A gap is an interval between timestamps that is longer than 1 s and than three times the median interval.
     """
     if len(t) < 2:
         return np.empty(0, dtype=np.int64)

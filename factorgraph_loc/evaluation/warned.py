@@ -17,7 +17,7 @@ def row_of(scores: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def by_text(rows: Sequence[Row]) -> dict[str, list[Row]]:
-    """Return the runs that have each warning, as {text of the warning: runs}, in order of the first run."""
+    """Return {text of a warning: runs with this warning}, in the order of the first run of each warning."""
     concerned: dict[str, list[Row]] = {}
     for row in rows:
         for text in (row.get(WARNINGS) or "").split("\n"):
@@ -27,7 +27,7 @@ def by_text(rows: Sequence[Row]) -> dict[str, list[Row]]:
 
 
 def lines(rows: Sequence[Row]) -> list[str]:
-    """Return each warning once. If only some of the estimators on a log have a warning, their names follow the text."""
+    """Return each distinct warning of the runs, with the names of the estimators if only some on a log have it."""
     texts = []
     for text, concerned in by_text(rows).items():
         logs = {row["log"] for row in concerned}

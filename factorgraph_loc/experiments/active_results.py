@@ -61,7 +61,7 @@ def metres(rows: Sequence[Row]) -> Array:
 
 
 def summaries(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Return statistics of the runs for each world, estimator and policy, as dictionaries with these further keys.
+    """Return statistics of the runs as dictionaries, for each ``world``, ``estimator`` and ``policy``. Further keys:
 
     - ``runs``: number of runs.
     - ``median``, ``p90``: median and 90th percentile of the distance [m] until the robot is localized.

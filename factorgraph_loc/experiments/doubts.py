@@ -19,7 +19,7 @@ LEAST_SHARE = 0.9  # minimum fraction of the estimates' time span that the refer
 def partly_scored(log: Log, final: Trajectory, max_gap: float) -> tuple[Notice, ...]:
     """Return a warning if the reference has too few poses for scores, or covers only part of the time of the estimates.
 
-    ``max_gap`` [s]: maximum gap across which estimates are interpolated for scores.
+    ``final``: the final trajectory. ``max_gap`` [s]: maximum gap across which estimates are interpolated for scores.
     """
     reference = log.reference
     if reference is None or not len(reference) or not len(final):
@@ -70,8 +70,7 @@ def never_localized(
 ) -> tuple[Notice, ...]:
     """Return a warning with a likely reason if the start is unknown and the robot was never localized.
 
-    ``sensors``: the used sensors. ``status``: of each causal estimate, such as "localized". ``final``: see
-    :func:`partly_scored`.
+    ``sensors``: the used sensors. ``status``: of each causal estimate, such as "localized". ``final``: the trajectory.
     """
     kinds_of_status = set(status)
     if "localized" in kinds_of_status or (len(final) and status[-1] == "unlocalized"):  # the latter: a batch estimator

@@ -164,8 +164,8 @@ class Facts:
         return digest
 
     def logs(self, source: LogSource, digest: str) -> list[LogFacts]:
-        """Return properties of all logs of a source with the hash ``digest``. Raises InputError if they cannot be
-        loaded."""
+        """Return properties of all logs of a source. ``digest``: hash of the source. Raises InputError if loading
+        fails."""
         if digest not in self._known.logs:
             self._known.logs[digest] = [_facts(log) for log in source.load_all()]
         return self._known.logs[digest]

@@ -72,7 +72,7 @@ class LogSource(ABC):
 
     @abstractmethod
     def identity(self) -> dict[str, Any]:
-        """Return the values that determine the log, together with the content of its files."""
+        """Return {name: value} of everything that determines the log, except for the content of its files."""
 
     def load(self) -> Log:
         """Return the log with the index ``number``."""
@@ -147,7 +147,7 @@ class RecordedSource(LogSource):
 
 @dataclass(frozen=True)
 class SimulatedSource(LogSource):
-    """A simulated log. ``preset``: a name or a TOML file. ``settings``: changed settings as JSON. ``seed``: of the
+    """A simulated log. ``preset``: a name or a TOML file. ``settings``: changed settings as JSON. ``seed``: for
     noise."""
 
     preset: str

@@ -130,9 +130,9 @@ def write_files(result: RunResult, log: Log, scores: Mapping[str, Any], folder: 
 
 
 def map_of(result: RunResult, log: Log) -> World | None:
-    """Return the log's map with the points that a run learnt, or None if the run learnt no points.
+    """Return the log's map with the points in space that a run estimated, or None if the run estimated no points.
 
-    The learnt points replace the points of the map, or are added to them if the run extended the map.
+    The estimated points replace the points of the map, or are added to them if the run extended the map.
     """
     points, known = result.learnt.points, log.world.points
     if points is None or not len(points):

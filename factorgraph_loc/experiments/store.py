@@ -120,8 +120,7 @@ class Store:
         return self.folder / key[:2] / key
 
     def state(self, key: str) -> State:
-        """Return the state of the results of the run ``key``: ok, failed, missing or damaged. It tests all
-        checksums."""
+        """Return the state of the results of the run ``key``: ok, failed, missing or damaged. It checks all files."""
         try:
             manifest = self._manifest(key)
             for name in manifest.files:

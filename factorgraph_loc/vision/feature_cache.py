@@ -80,7 +80,8 @@ class FeatureCache:
         self.fault = ""
 
     def read(self, key: str) -> bytes | None:
-        """Return the bytes stored under ``key``, or None if they are missing or damaged. Their last use is now."""
+        """Return the bytes stored under ``key``, None if missing or damaged. This updates the time of their last
+        use."""
         path = self._path(key)
         try:
             stored = read_bytes(path, DATA)
@@ -96,8 +97,8 @@ class FeatureCache:
         return content
 
     def write(self, key: str, content: bytes) -> None:
-        """Store ``content`` under ``key``, atomically. If it cannot be written, no error is raised, but ``fault`` is
-        set."""
+        """Store ``content`` under ``key``, atomically. If it cannot be written, ``fault`` is set but no error
+        raised."""
         if self.fault:
             return
         path = self._path(key)

@@ -59,7 +59,7 @@ def evaluate(
     :class:`~factorgraph_loc.evaluation.features.repeatability.Repeatability`, and also:
 
     - ``feature``, ``sequence``: their names. ``image``: number of the later image. ``change``: kind of change between
-      both images, such as "rotation". ``amount``: its amount.
+      both images, such as "rotation". ``amount``: size of this change.
     - ``features``: number of features in the later image. ``milliseconds``: time to compute them on one thread.
 
     ``progress`` is called after each image.
@@ -97,8 +97,8 @@ def match_scores(
     """Return the scores of the matches between two images. A match is correct if both points lie in the common part of
     the images and their regions overlap.
 
-    ``first``, ``second``: points of the images. ``mutual``: matches of mutual nearest neighbours. ``clear``: those of
-    them with a small distance ratio. ``homography`` (3, 3): maps the first image to the second. ``shapes``: (height,
+    ``first``, ``second``: points of the images. ``mutual``: matches of mutual nearest neighbours. ``clear``: mutual
+    matches with a small distance ratio. ``homography`` (3, 3): from the first image to the second. ``shapes``: (height,
     width, ...) of both images.
     """
     in_first, in_second = common(first, second, homography, shapes)

@@ -34,11 +34,11 @@ Shapes = tuple[tuple[int, ...], tuple[int, ...]]  # height, width, ... of both i
 
 
 class Repeatability(NamedTuple):
-    """Repeatability scores of a pair of images, from 0 to 1. Both scores are 0 if ``regions`` is 0.
+    """Repeatability scores of a pair of images, from 0 to 1. A region is the image area that a keypoint describes.
 
     ``regions``: the number of regions in the common part of both images; the smaller of the counts in both images.
     ``repeatability``: number of corresponding regions (:func:`overlaps`) divided by ``regions``. ``strict``: number of
-    regions that also have similar sizes (:func:`alike_regions`), divided by ``regions``.
+    regions that also have similar sizes (:func:`alike_regions`), divided by ``regions``. Without regions both are 0.
     """
 
     regions: int
@@ -100,8 +100,8 @@ def alike_regions(first: Keypoints, second: Keypoints, homography: Array) -> Can
 
 
 def common(first: Keypoints, second: Keypoints, homography: Array, shapes: Shapes) -> tuple[Truths, Truths]:
-    """Return a mask of the points ``first`` inside the second image, and a mask of the points ``second`` inside the
-    first image. Arguments: see :func:`repeatability`."""
+    """Return a mask of the points ``first`` that lie inside the second image after mapping. Also return such a mask of
+    the points ``second`` for the first image. Arguments: see :func:`repeatability`."""
     back = invert(homography)
     return (
         inside(project(homography, first.points), shapes[1]),
@@ -170,7 +170,7 @@ def shared_area(centres: Array, ellipses: Array) -> Array:
 
 
 def distinct(keypoints: Keypoints) -> Keypoints:
-    """Return the keypoints without duplicates, which have the same position and size."""
+    """Return the keypoints without duplicates. A duplicate has the same position and size as another keypoint."""
     rows = np.column_stack((keypoints.points, keypoints.sizes))
     _, index = np.unique(rows, axis=0, return_index=True)
     return keypoints[np.sort(index)]

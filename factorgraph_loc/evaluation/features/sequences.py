@@ -173,7 +173,7 @@ def find_sequences(paths: Several[Path]) -> list[Sequence]:
 
 
 def read_sequence(folder: Path) -> Sequence:
-    """Return the sequence in a folder: the images ``imgK.*`` and the homographies ``H1toKp``, with K from 1 or 2 on.
+    """Return the sequence in a folder: images ``img1.*``, ``img2.*`` and so on, with homographies ``H1to2p`` and so on.
 
     Raises InputError for a missing or damaged file.
     """

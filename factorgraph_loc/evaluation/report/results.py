@@ -181,11 +181,11 @@ class Results:
             self._runs.setdefault((variant, log), []).append(row)
 
     def runs(self, variant: str, log: str) -> list[Row]:
-        """Return the runs of a variant on a log, as rows with the seed and the scores."""
+        """Return the runs of the variant with this name on a log, as rows with the seed and the scores."""
         return self._runs.get((variant, log), [])
 
     def of(self, variant: str) -> list[Row]:
-        """Return the runs of a variant on all logs."""
+        """Return the runs of the variant with this name on all logs, as rows with the seed and the scores."""
         return [row for log in self.logs for row in self.runs(variant, log)]
 
     def scores(self, metric: str, variant: str) -> dict[str, dict[int, float | None]]:

@@ -137,7 +137,7 @@ def _nothing_in_common(
 
 @dataclass(frozen=True)
 class Similarity:
-    """The transformation ``scale * rotation @ p + translation`` of a point p. ``translation`` (3,) [m]."""
+    """The transformation ``scale * rotation @ p + translation`` of a point p (3,) [m]."""
 
     rotation: Array
     translation: Array

@@ -131,7 +131,7 @@ def extents(score: TrajectoryScore) -> dict[str, str]:
 
 
 def page(score: TrajectoryScore) -> str:
-    """Return the report as one HTML page."""
+    """Return the report of a comparison as the text of an HTML page."""
     lead = (
         f"The position error (RMSE) of {score.estimate.name} is {number(score.figures['ape.position_rmse'])} m, over "
         f"{len(score.estimate)} poses of {score.reference.name}."

@@ -97,7 +97,7 @@ class TrajectoryScore:
         return figures
 
     def seconds(self) -> Array | None:
-        """Return the times (N,) [s] of the pairs since the first pair, or None if there are no timestamps."""
+        """Return the times (N,) [s] of the N paired poses since the first pair, or None if there are no timestamps."""
         return _seconds(self.estimate, self.reference)
 
     def document(self) -> dict[str, Any]:
@@ -199,9 +199,9 @@ def pose_errors(
 
 
 def relative_errors(pair: Associated, length: float, unit: str, *, all_pairs: bool = False) -> PoseErrors | None:
-    """Return relative errors over pieces of a path. None without rotations, or for "s" without timestamps.
+    """Return relative errors over pieces of a path. ``unit``: "m" for a ``length`` of path in metres, "s" for a time.
 
-    ``unit``: "m" for a ``length`` of path in metres, "s" for a time in seconds. ``all_pairs``: see :func:`score_paths`.
+    ``all_pairs``: see :func:`score_paths`. Returns None if there are no rotations, or no timestamps for the unit "s".
     """
     estimate, truth = pair.estimate, pair.reference
     if not (estimate.has_rotations and truth.has_rotations):
