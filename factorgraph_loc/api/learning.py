@@ -99,8 +99,7 @@ def features(
     overwrite: bool = False,
     progress: Callable[[float, float], None] = lambda _done, _total: None,
 ) -> pl.DataFrame:
-    """Evaluate point features on ``images`` of planar scenes. Return a table of scores, and write it to the folder
-    ``out``.
+    """Evaluate point features on ``images`` of planar scenes. Return the scores, and write them to the folder ``out``.
 
     ``images``: folders of image sequences, or photographs. Known homographies warp photographs to image sequences.
     ``features``: names of the features to compare. ``count``: maximum number of features in an image. ``progress`` is

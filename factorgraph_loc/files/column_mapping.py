@@ -123,7 +123,7 @@ def _mapped(
 ) -> Cells:
     """Return the cells of a file by field. ``columns``: the cells by column name. ``available``: all column names.
 
-    ``unwanted``, ``passed`` and ``unread`` are fields of :class:`Cells`."""
+    ``unwanted``, ``passed`` and ``unread`` become fields of the :class:`Cells`."""
     fields = {field: columns[name] for field, name in mapping.columns.items() if name in columns}
     read = {*mapping.columns.values(), *mapping.where}
     left_out = tuple(name for name in available if name not in read)
@@ -307,8 +307,7 @@ def _require_columns(
 def _read_json_lines(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]) -> Cells:
     """Return the mapped columns of a file whose lines are JSON objects or lists of JSON objects.
 
-    Objects that ``where`` excludes or that lack a ``needed`` column are ignored. Raises InputError if all objects lack
-    one."""
+    Objects that ``where`` excludes or that lack a ``needed`` column are ignored. Raises InputError if all lack one."""
     unread: list[tuple[int, str]] = []
     objects = list(_objects(path, unread))
     where = mapping.chosen()

@@ -105,7 +105,7 @@ def manifest_of_folder(tables: Path, folder: Path) -> Proposal:
 
 
 def _needs_of_rig(roles: _Roles) -> list[str]:
-    """Return remarks about the sections that the rig file must have, with the commands that write such a file."""
+    """Return hints on what a rig file must have for the tables in ``roles``, with commands that write such a file."""
     out = []
     if "rfid" in roles.tables and roles.tables["rfid"].has("antenna"):
         antennas = dict.fromkeys(roles.tables["rfid"].columns[roles.tables["rfid"].fields["antenna"]])
@@ -144,7 +144,8 @@ def _map_in_parent(path: Path, roles: _Roles) -> list[str]:
 
 
 def _map_settings(role: str, roles: _Roles) -> dict[str, Any]:
-    """Return the settings of a world file for the table of the map. ``role``: "tags" or "landmarks".
+    """Return settings for the table of tags or landmarks in ``roles``, as lines of a world file. ``role``: "tags" or
+    "landmarks".
 
     If the EPCs in the map and in the reads differ in letter case, a setting converts the EPCs of the map."""
     table, reads = roles.tables[role], roles.tables.get("rfid")
@@ -168,7 +169,7 @@ def _guesses(folder: Path) -> list[Guess]:
 
 
 def _roles(guesses: Sequence[Guess]) -> _Roles:
-    """Assign a role to each of the tables ``guesses``. Return the roles.
+    """Return a proposed use, such as "odometry", of each of the tables ``guesses``.
 
     A table of poses is the reference if its file name suggests ground truth, or if another table is the odometry."""
     out = _Roles()
@@ -223,8 +224,8 @@ def _wheel_fields(table: Guess) -> tuple[str, ...]:
 
 
 def _table_settings(role: str, table: Guess, roles: _Roles, path: Path) -> dict[str, Any]:
-    """Return the settings that describe a table with a ``role`` in the manifest. ``roles``: the tables of all roles.
-    ``path``: the folder of the tables."""
+    """Return the settings that describe a table in the manifest. ``role``: its use, such as "odometry". ``roles``: the
+    tables of all uses. ``path``: the folder of the tables."""
     sides = _wheel_fields(table) if role == "odometry" else ()
     if sides:
         settings = table.mapping(("t", *sides))

@@ -175,7 +175,7 @@ def rank(name: str, known: Sequence[str]) -> int | None:
 
 
 def guess(path: Path) -> Guess | None:
-    """Guess the fields and units of a table. Returns None if the file is not a table of at least two rows and two columns."""
+    """Return the guessed fields and units of a table, or None if the file is not a table with rows and columns."""
     numbered = [(row, line) for row, line in enumerate(read_text(path).splitlines(), start=1) if line.strip()]
     comments, content = split_comments(numbered)
     for separator in SEPARATORS:

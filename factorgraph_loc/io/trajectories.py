@@ -55,7 +55,7 @@ def read_trajectory(source: str | Path) -> PosePath:
 
 
 def _in_bag(text: str) -> tuple[Path, str] | None:
-    """Split ``BAG:TOPIC`` into the path and the topic, which may be "". Returns None if ``text`` names no bag."""
+    """Return the path and the topic in ``BAG:TOPIC``. The topic may be "". Returns None if ``text`` names no bag."""
     parts = text.split(TOPIC)
     for i in range(len(parts), 0, -1):
         path = Path(TOPIC.join(parts[:i]))

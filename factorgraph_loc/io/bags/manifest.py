@@ -288,9 +288,9 @@ def _camera(out: Uses, topics: Sequence[Topic]) -> None:
 
 
 def _custom(out: Uses, bag: Bag, topics: Sequence[Topic]) -> list[tuple[Topic, list[str]]]:
-    """Return the topics that ``out`` does not use and that have message types from outside of ROS.
+    """Return (topic, paths of its message fields) for the topics whose message types do not come with ROS.
 
-    Each topic has the list of the paths of its message fields."""
+    Topics that ``out`` already uses are left out. A topic that cannot be read adds a remark to ``out``."""
     custom = []
     for topic in topics:
         if topic.name in out.uses or topic.type.startswith(

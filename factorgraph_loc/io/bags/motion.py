@@ -234,7 +234,8 @@ def _velocities(rows: TopicRows, warnings: list[Notice]) -> tuple[Integers, Arra
 def _of_poses(listeners: Listeners, options: OdometryTopic, static: StaticFrames) -> Motion:
     """Register a collector of poses or tf at ``listeners``. Return a function that computes odometry from them.
 
-    ``static``: the static transforms of the bag."""
+    The function returns timestamps (N,) [ns] and increments (N, 3 or 4). ``static``: the static transforms of the bag.
+    """
     made = poses_of_topic(listeners, options, static)
 
     def motion(warnings: list[Notice]) -> tuple[Integers, Array]:

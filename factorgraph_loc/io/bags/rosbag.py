@@ -185,8 +185,8 @@ def _left_out(bag: Bag, listeners: Listeners) -> str:
 
 
 def _sensors(listeners: Listeners, options: Options, frames: StaticFrames, stack: ExitStack) -> dict[str, Any]:
-    """Register collectors at ``listeners`` for all sensors in ``options`` except odometry, and return them by the names
-    of their streams. ``stack``: closes temporary files at the end. ``frames``: the static transforms of the bag."""
+    """Return a collector of each sensor in ``options`` except odometry, registered at ``listeners``, by the sensor's
+    name. ``stack``: closes temporary files at the end. ``frames``: the static transforms of the bag."""
     bag = listeners.bag
     out: dict[str, Any] = {}
     if options.imu:

@@ -98,7 +98,8 @@ def check_path(store: Typestore, topic: Topic, path: str, where: str) -> None:
 
 
 def leaves(store: Typestore, kind: str, prefix: str = "", depth: int = DEPTH) -> list[str]:
-    """Return the paths of all numbers, texts, bytes and timestamps in the message type ``kind``.
+    """Return the paths of all numbers, texts, bytes and timestamps in the message type ``kind``, such as
+    "header.stamp".
 
     ``store``: the message definitions. ``prefix``: put before each path. ``depth``: maximum nesting level.
     """

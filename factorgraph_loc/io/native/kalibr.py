@@ -50,7 +50,7 @@ def is_chain(text: str) -> bool:
 
 
 def read_camera(text: str) -> tuple[dict[str, Any], list[str]]:
-    """Read a camera of a Kalibr camera chain. Return the section ``[camera]`` of a rig file, and remarks for the user.
+    """Return a camera of a Kalibr camera chain as the section ``[camera]`` of a rig file, and remarks for the user.
 
     ``text``: the file of the chain; ``FILE:cam1`` selects one of several cameras. Raises InputError if the file is
     invalid or the lens model is not supported.

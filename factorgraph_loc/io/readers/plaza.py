@@ -75,7 +75,7 @@ def read(path: Path | None, options: Options) -> Log:
 
 
 def read_matlab(path: Path, fields: Mapping[str, int]) -> tuple[dict[str, Array], list[str]]:
-    """Read arrays of a MATLAB file (version 5 to 7). Return them by name, and the names of all other arrays.
+    """Return arrays of a MATLAB file (version 5 to 7) by name, and a list of the names of all other arrays.
 
     ``fields``: the number of columns of each array to read, by name. Raises InputError with the file and the name of a
     missing, invalid or too large array.
