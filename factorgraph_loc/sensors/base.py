@@ -34,7 +34,7 @@ Columns = Mapping[str, slice]  # the indices of each block in the vector of the 
 
 @dataclass(frozen=True)
 class Term:
-    """A factor of the graph on one robot pose and on named blocks of the state, such as the position of a landmark.
+    """A factor of the graph on one robot pose and on named blocks of the state (such as a landmark's position).
     ``blocks``: the names of these blocks. ``rows``: the dimension of the residual."""
 
     factor: Factor

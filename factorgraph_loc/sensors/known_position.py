@@ -64,8 +64,9 @@ class KnownPosition:
         return se2.compose(starts, self.motion.relative(self.odometry, now).delta)
 
     def drawn(self, rng: np.random.Generator, count: int, now: ChainState) -> Array:
-        """Return ``count`` random poses (N, 3) at the odometry state ``now``. They start at random positions of the
-        prior, with stratified headings over the full circle, and move with the odometry and its noise."""
+        """Return ``count`` random poses (N, 3) at the odometry state ``now``. The start positions are drawn from the
+        prior. The start headings are stratified over the full circle. The odometry and its noise move the starts to the
+        poses."""
         moved = self.motion.relative(self.odometry, now)
         positions = self.prior.pose[:2] + positive.draws(self.prior.covariance[:2, :2], count, rng)
         headings = (rng.permutation(count) + rng.random(count)) * 2.0 * math.pi / count - math.pi
@@ -109,8 +110,9 @@ class KnownPosition:
         return np.linalg.solve(root, error[0]), np.linalg.solve(root, jacobian[0]), moved.covariance
 
     def _linearized(self, poses: Array, now: ChainState, noise: Array | None) -> tuple[Array, Array, Array]:
-        """Return errors (N, 2) of the start positions that follow from ``poses`` (N, 3), Jacobians (N, 2, 3) of the
-        errors by the poses, and covariances (N, 2, 2) of the errors. For the arguments see :meth:`loss`."""
+        """Return errors (N, 2) of start positions, their Jacobians (N, 2, 3) by the poses, and their covariances
+        (N, 2, 2). The start positions follow from ``poses`` (N, 3) and the odometry. For the arguments see
+        :meth:`loss`."""
         moved = self.motion.relative(self.odometry, now)
         back = se2.inverse(moved.delta)
         error = se2.compose(poses, back)[:, :2] - self.prior.pose[:2]

@@ -149,7 +149,7 @@ def make_images(table: TableRows, t0_ns: int, warnings: list[Notice], folder: Pa
 
     ``t0_ns``: the absolute time of t = 0 [ns]. ``warnings``: a list to append a warning about missing images to.
     ``folder``: the folder of the images, by default ``camera`` next to the table. Raises InputError if a path is
-    outside of the folder or is no regular file, or if a timestamp is more than 0.5 s before that of an earlier row.
+    outside of the folder or is no file, and if a timestamp is more than 0.5 s before an earlier row.
     """
     latest = checks.last_in_order(table.path, table.rows, table.t_ns, warnings, rules=table.rules).tolist()
     within = inside(table.path.parent, FOLDER, table.path) if folder is None else folder

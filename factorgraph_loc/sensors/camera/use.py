@@ -135,7 +135,7 @@ def _without_features(log: Log, stream: ImageStream, estimator: str) -> Prepared
 
 class CameraIntake(Intake):
     """Detects features in images for the live localizer. Raises InputError if the length of descriptors differs from
-    those in the map, or from the first ones if the map has none."""
+    the map. If the map has no descriptors, the length must be that of the first image."""
 
     def __init__(self, rig: Rig, world: World) -> None:
         points = world.points

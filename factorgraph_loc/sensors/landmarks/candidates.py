@@ -77,8 +77,8 @@ class Candidate:
     due: float = FEWEST
 
     def plus(self, sighting: PartialSighting, source: object) -> Candidate:
-        """Return a copy with the further ``sighting``. ``source``: any object, stored with the sighting. The previous
-        sighting is replaced if the robot has moved less than APART [m] since the one before it."""
+        """Return a copy with the further ``sighting``. ``source``: any object, stored with the sighting. The new
+        sighting replaces the last one if the robot moved less than APART [m] between the last two."""
         end = len(self.sightings)
         if end > 1:
             previous, last = (np.array(s.odometry[1:3]) for s in self.sightings[-2:])

@@ -212,9 +212,10 @@ LANDMARKS = Table(
 def read_layer(content: Any, source: object, folder: Path) -> Any:
     """Return the landmarks of a world file. If its section ``landmarks`` names a table, they are read from the table.
 
-    ``content``: the section. For a table, it assigns columns to the fields landmark, x, y and optionally z, and to
-    sigma or both sigma_x and sigma_y. The larger of the two is used. ``source``: the name of the world file in
-    messages. ``folder``: the folder of the table. Raises InputError for an invalid value or a duplicate name.
+    ``content``: the section. For a table, it assigns columns to the fields landmark, x, y and optionally z. It also
+    assigns columns to sigma or both sigma_x and sigma_y. The larger of the two is used. ``source``: the name of the
+    world file in messages. ``folder``: the folder of the table. Raises InputError for an invalid value or a duplicate
+    name.
     """
     if not isinstance(content, dict) or not isinstance(content.get("file"), str):
         return content

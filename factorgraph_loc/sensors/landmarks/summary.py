@@ -216,8 +216,8 @@ def _unmatched(log: Log) -> tuple[tuple[str, ...], dict[str, int]]:
 
 
 def _shifted(log: Log) -> list[Notice]:
-    """Return a list with a warning if sightings and reference agree clearly better after a time shift, or with
-    landmarks at another height, otherwise []."""
+    """Return a list with a warning if a time shift or another height of the landmarks clearly improves the agreement of
+    sightings and reference. Returns [] otherwise."""
     stream, reference = log.streams.get("bearing_range"), log.reference
     if not isinstance(stream, BearingRangeStream) or reference is None or log.rig.find(BearingRangeSettings) is None:
         return []

@@ -176,7 +176,7 @@ def _noise_factor(logs: Sequence[Log], model: OdometryModel) -> float:
 
 def _unit_covariances(windows: Windows, model: OdometryModel) -> Array:
     """Return the covariances (M, 11, 3, 3) of the errors in each window if one of 11 variances is 1 and all others 0.
-    The variances are those of longitudinal, lateral and heading errors, each per distance, rotation and time, then
+    Nine variances are those of longitudinal, lateral and heading errors, each per distance, rotation and time. Two are
     those of position and heading of the reference."""
     start, end = windows.states(model)
     drivers = np.abs(end - start)[:, [4, 5, 0]]  # distance, rotation, time in motion

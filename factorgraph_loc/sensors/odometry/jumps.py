@@ -65,8 +65,8 @@ def jumps(stream: Motion) -> list[Jump]:
 
 
 def _outliers(rates: Array, least: float) -> Integers:
-    """Return the indices of those ``rates`` (N,) that are more than FACTOR times the median of the previous rates, and
-    that differ from the median by more than ``least``."""
+    """Return the indices of ``rates`` (N,) that are outliers. An outlier is more than FACTOR times the median of the
+    previous rates, and differs from this median by more than ``least``."""
     usual = _previous_medians(rates, 0.0)
     return np.flatnonzero((np.abs(rates - usual) > least) & (np.abs(rates) > FACTOR * np.abs(usual)))
 

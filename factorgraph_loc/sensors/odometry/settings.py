@@ -10,7 +10,7 @@ from factors.odometry.model import PARAMETERS, Growth
 
 
 class GrowthSettings(FileModel):
-    """Noise of one component of the odometry. The variance grows with distance, rotation and time."""
+    """Noise of an odometry error (along, lateral or heading). The variance grows with distance, rotation and time."""
 
     per_distance: Noise = 0.0
     """standard deviation per sqrt(m) travelled"""

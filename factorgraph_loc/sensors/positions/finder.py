@@ -35,7 +35,8 @@ SEARCH_INTERVAL = 1.0  # s between searches while positions contradict the pose
 
 
 class Row(NamedTuple):
-    """A measured position: the ``odometry`` state at its time, and its ``factor`` on the pose at its time."""
+    """A measured position. ``odometry``: the odometry state at its time. ``factor``: a factor on the pose at its
+    time."""
 
     odometry: ChainState
     factor: PositionFactor

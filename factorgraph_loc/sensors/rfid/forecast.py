@@ -31,8 +31,7 @@ MOST_LOOKS = 1 << 16  # maximum number of rounds on a path
 
 
 class ScanTables(NamedTuple):
-    """Probabilities that A antennas read a tag, tabulated by the pose of the tag in the robot frame, and a map of T
-    tags.
+    """Read probabilities of A antennas, tabulated by the pose of a tag in the robot frame, and a map of T tags.
 
     The pose has C cells: H heights x F facings x S x S positions. The last facing is for tags with an unknown facing.
     ``read`` (C, A): the probability q of a read. ``gain`` (A, C): log(q / (1 - q)). ``missed`` (C,): the sum of

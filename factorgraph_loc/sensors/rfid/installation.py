@@ -28,9 +28,9 @@ Run = TypeVar("Run", Log, Setup, Ride)
 def installed(run: Run) -> Run:
     """Return a copy of ``run`` that describes antennas in the building as antennas of the rig.
 
-    If the tags are on the robot, the antennas of the map are added to the rig, and the tags of the rig become the tags
-    of the map. A rig with antennas on the robot is not changed. Raises InputError if the map has no antennas, if an
-    antenna has an unknown detection model, or if a tag on the robot is also in the map.
+    If the tags are on the robot, the antennas of the map are added to the rig. The tags of the rig become the tags of
+    the map. A rig with antennas on the robot is not changed. Raises InputError if the map has no antennas, or if an
+    antenna has an unknown detection model. Raises InputError if a tag on the robot is also in the map.
     """
     settings = run.rig.find(RfidSettings)
     if settings is None or not settings.tags or settings.antennas:
@@ -63,8 +63,8 @@ def is_fixed(rig: Rig) -> bool:
 
 
 def check(use: Use) -> Use:
-    """Return ``use`` unchanged. Raises InputError if an antenna of the log is not in the map although the tags are on
-    the robot, or if it is in the map although the rig has antennas on the robot."""
+    """Return ``use`` unchanged. Raises InputError if the tags are on the robot and the map lacks an antenna of the log.
+    Raises InputError if the antennas are on the robot, and an antenna that the rig lacks is in the map."""
     settings, stream = use.log.rig.find(RfidSettings), use.log.streams.get("rfid")
     if settings is None or "rfid" not in use.sensors or not isinstance(stream, RfidStream):
         return use

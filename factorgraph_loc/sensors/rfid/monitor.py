@@ -200,8 +200,8 @@ class ReadGroups:
     """Sums of observed and predicted reads in G groups: one for each interval of the distance between antenna and tag,
     then one for each of the ``antennas``.
 
-    ``sums`` (3, G): the number of observed reads, the number of predicted reads, and the variance of the number of
-    observed reads if all rounds were independent.
+    ``sums`` (3, G): the number of observed reads, the number of predicted reads, and the variance of the former for
+    independent rounds.
     """
 
     antennas: Sequence[str]
@@ -266,8 +266,8 @@ class ConsistencyMonitor:
         self.doubted = chance < (TRUSTED if self.doubted else DOUBTED)
 
     def _chance(self, groups: slice, overdispersion: float) -> float:
-        """Return the p-value of the observed reads in ``groups`` if the model is correct, or 1 if the relative error is
-        at most DIFFERENT. ``overdispersion``: the number of correlated rounds that count as one."""
+        """Return the p-value of the observed reads in ``groups`` if the model is correct. Returns 1 if the relative
+        error is at most DIFFERENT. ``overdispersion``: the number of correlated rounds that count as one."""
         observed, predicted, variance = _merged(self._groups.sums[:, groups], FEWEST)
         off = observed - predicted
         if np.sum(np.abs(off)) <= DIFFERENT * np.sum(predicted):

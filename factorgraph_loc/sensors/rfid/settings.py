@@ -75,7 +75,8 @@ class BeamSettings(FileModel):
 
 
 class LogisticSettings(FileModel):
-    """A detection model by logistic regression. See :class:`factors.rfid.model.LogisticModel`."""
+    """A detection model by logistic regression on 11 features of the tag's pose in the antenna frame. See
+    :class:`factors.rfid.model.LogisticModel`."""
 
     kind: Literal["logistic"] = "logistic"
     prior: PriorSettings = Field(default_factory=PriorSettings)
@@ -319,7 +320,8 @@ class RfidSettings(SensorSettings):
 
 
 class SurveySettings(FileModel):
-    """The transform from the survey frame of the tags to the world frame: a rotation, followed by a translation."""
+    """The transform from the survey frame of the tags to the world frame: a rotation about the point (``about_x``,
+    ``about_y``), followed by a translation."""
 
     x: Annotated[float, Field(ge=-1000.0, le=1000.0), InUnit("m")] = 0.0
     """translation of the map's tags along x, after the rotation"""

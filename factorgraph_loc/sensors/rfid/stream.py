@@ -203,8 +203,8 @@ def _rounds(where: str, times: Sequence[float], names: tuple[str, ...], reads: S
     """Return the index (R,) of the round of each of R reads. ``times``: times of the reads [s]. ``names``: the antenna
     of each round. ``where``: the name of the scan in error messages.
 
-    A read with an unknown round is assigned to the first round of its antenna without a read of the same tag, in order
-    of time. If there is no such round, it is assigned to the last round.
+    Reads are assigned in order of time. A read with an unknown round is assigned to the first round of its antenna
+    without a read of the same tag. If there is no such round, it is assigned to the last round.
     """
     own = {name: [k for k, antenna in enumerate(names) if antenna == name] for name in names}
     out = np.full(len(reads), -1, dtype=np.int64)

@@ -133,7 +133,7 @@ class Kind:
     own: bool = False
 
     def label(self) -> str:
-        """Return the name of this kind of model for tables."""
+        """Return the name of this kind of model for tables, such as "logistic, with facing, one for all"."""
         facing = ", with facing" if self.facing else ""
         return f"{self.name}{facing}, {'one per antenna' if self.own else 'one for all'}"
 

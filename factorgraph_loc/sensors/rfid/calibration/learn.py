@@ -246,7 +246,7 @@ def _overdispersion(pairs: TagPairs, logit: Array, floor: Floor) -> tuple[float,
 
 def _geometry_by_phases(logs: Sequence[Log], settings: RfidSettings, survey: SurveySettings) -> PhaseFit | None:
     """Return the survey transform and the correction of antenna positions, estimated from phases. Returns None if there
-    are too few phases, or if they do not agree better with the estimates than with ``survey`` and ``settings``."""
+    are too few phases, or if the estimates do not improve the agreement of the phases."""
     try:
         phase = fit_phase(logs, settings, survey)
     except InputError:

@@ -129,8 +129,8 @@ def family_of(model: DetectionModel, pairs: TagPairs) -> Family:
 
 
 def fit_model(pairs: TagPairs, family: Family, floor: Floor) -> tuple[DetectionModel, Posterior]:
-    """Return the maximum a posteriori detection model of a ``family`` for the reads and misses in ``pairs``, and the
-    posterior of its parameters. ``floor``: probabilities of false reads and misses."""
+    """Return the maximum a posteriori detection model of a ``family``, and the posterior of its parameters. ``pairs``:
+    reads and misses. ``floor``: probabilities of false reads and misses."""
     data = _with_edge_misses(pairs) if family.design else pairs
     design = family.design(data.points, data.facing) if family.design else None
 

@@ -115,10 +115,11 @@ def overdispersion(
 ) -> tuple[float, float]:
     """Return the overdispersion of reads, at least 1, and its standard error.
 
-    The variance of the number of reads of a tag by an antenna in a time block is divided by its value for independent
-    reads (McCullagh and Nelder, "Generalized linear models", 1989, section 4.5). If the result is n, n correlated
-    rounds have as much information as one independent round. ``hits``, ``count`` (M,): numbers of reads and of rounds.
-    ``p`` (M,): predicted probability of a read in one round. ``antenna``, ``tag``, ``block`` (M,): their numbers.
+    The number of reads of a tag by an antenna in a time block has a variance. The overdispersion is this variance
+    divided by its value for independent reads (McCullagh and Nelder, "Generalized linear models", 1989, section 4.5).
+    If it is n, n correlated rounds have as much information as one independent round. ``hits``, ``count`` (M,): numbers
+    of reads and of rounds. ``p`` (M,): predicted probability of a read in one round. ``antenna``, ``tag``, ``block``
+    (M,): their numbers.
     """
     first, cell = cells(np.column_stack((block, tag, antenna)), (1.0, 1.0, 1.0))
     excess, variance = np.bincount(cell, hits - count * p), np.bincount(cell, count * p * (1.0 - p))
