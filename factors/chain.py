@@ -127,8 +127,8 @@ def _eliminated(system: System, damping: float) -> tuple[bool, Array, Array, Arr
 def solved(system: System, damping: float) -> tuple[bool, Array, Array]:
     """Solve the normal equations ``system`` for one damped step. The diagonal is multiplied by ``1 + damping``.
 
-    The results are True if the poses are determined, the step of the poses (N, 3), and the step of the parameters (P,).
-    The steps are zero if the first value is False. Raises LinAlgError if the parameters are not determined.
+    Returns three values: True if the poses are determined, the step of the poses (N, 3), and the step of the parameters
+    (P,). The steps are zero if the first value is False. Raises LinAlgError if the parameters are not determined.
     """
     solvable, _, by_next, by_side, left = _eliminated(system, damping)
     shared, poses = len(left) - 1, np.zeros((len(by_side), POSE))

@@ -215,7 +215,8 @@ class PriorFactor:
         self._whitener = positive.whitener(covariance)
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Return the residual (3,) ``log(mean^-1 * pose)`` and a list of one Jacobian (3, 3), both whitened."""
+        """Return the whitened residual (3,) ``log(mean^-1 * pose)`` and a list of its Jacobian (3, 3). ``values``: a
+        list of the pose (3,)."""
         error = se2.log(se2.between(self._mean, values[0]))
         return self._whitener @ error, [self._whitener @ se2.inverse_right_jacobian(error)]
 

@@ -50,7 +50,7 @@ class ChainState(NamedTuple):
 
 
 def propagate(covariance: Array, increment: Increment) -> Array:
-    """Return the body-frame covariance (3, 3) of a pose after the motion ``increment``, from the one before it."""
+    """Return the body-frame covariance (3, 3) of a pose after a motion. ``covariance`` (3, 3): before the motion."""
     return np.asarray(carried(covariance, increment.delta, increment.covariance))
 
 

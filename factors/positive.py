@@ -79,8 +79,7 @@ def root(covariances: Array) -> Array:
 
 
 def solve(covariances: Array, right: Array) -> Array:
-    """Solve ``covariances @ x = right``. Shapes: covariances (..., D, D), ``right`` (..., D, N). Returns x (..., D,
-    N)."""
+    """Return the solution x (..., D, N) of ``covariances @ x = right``. ``covariances``: (..., D, D)."""
     try:
         return np.asarray(np.linalg.solve(covariances, right))
     except np.linalg.LinAlgError:

@@ -83,7 +83,8 @@ def exp(xi: Array) -> Array:
 
 
 def log(pose: Array) -> Array:
-    """Return the twist (..., 3) from the origin to ``pose`` in unit time. Inverts :func:`exp` for headings below pi."""
+    """Return the twist (..., 3) from the origin to ``pose`` in unit time, the inverse of :func:`exp` for absolute
+    headings below pi."""
     pose = np.asarray(pose, dtype=float)
     if pose.ndim == 1:
         return np.array(log_scalars(*pose.tolist()))
@@ -265,7 +266,7 @@ def between_one(a: Array, b: Array) -> Array:
 
 @compiled
 def right_jacobian(xi: Array) -> Array:
-    """Right Jacobian (3, 3) of :func:`exp` at one twist (3,): ``exp(xi + d) ~ exp(xi) * exp(right_jacobian(xi) d)``."""
+    """Return the right Jacobian J (3, 3) of :func:`exp` at one twist (3,): ``exp(xi + d) ~ exp(xi) * exp(J d)``."""
     angle = xi[2]
     p, q = arc_coefficients(angle)
     r, s = (angle / 6.0, 0.5 - angle * angle / 24.0) if abs(angle) < SMALL else ((1.0 - p) / angle, q / angle)

@@ -28,8 +28,7 @@ VIEW = 5.0  # standard deviations; larger residuals are drawn at the edge
 
 
 def constants_table(constants: Sequence[FittedConstant], logs: Sequence[str] = ()) -> Rows:
-    """Return a table (header, rows) of constants: initial and learnt value, its standard deviation, and that of the
-    prior.
+    """Return a table (header, rows) of constants: initial value, learnt value with standard deviation, prior.
 
     ``logs``: names of the logs. If there are any, the table also has the values that are learnt from each log
     separately.

@@ -74,8 +74,7 @@ class Posterior:
         return {p.name: float(v) for p, v in zip(self.parameters, self.values, strict=True)}
 
     def correlations(self) -> list[tuple[str, str, float]]:
-        """Return tuples (name, name, correlation) of all pairs with an absolute correlation above
-        :data:`CORRELATED`."""
+        """Return tuples (name, name, correlation) of pairs with an absolute correlation above :data:`CORRELATED`."""
         matrix = self.covariance / np.outer(self.errors, self.errors)
         rows, columns = np.nonzero(np.abs(np.triu(matrix, 1)) > CORRELATED)
         names = [p.name for p in self.parameters]

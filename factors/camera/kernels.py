@@ -177,9 +177,8 @@ def project(k: Lens, points: Array) -> tuple[Array, Array]:
 @compiled(error_model="numpy")
 def linearize_in_space(k: Lens, position: Array, rotation: Array, points: Array) -> tuple[Array, Array, Array]:
     """Project world ``points`` (K, 3) to the pixels of a camera at ``position`` (3,) with ``rotation`` (3, 3) in the
-    world.
-    ``k``: the lens. Returns the pixels (K, 2) and their Jacobians by the camera's perturbation (K, 2, 6) and by the
-    points (K, 2, 3). The perturbation is in the camera frame, with rotation before translation."""
+    world. ``k``: the lens. Returns the pixels (K, 2) and their Jacobians by the camera's perturbation (K, 2, 6) and by
+    the points (K, 2, 3). The perturbation is in the camera frame, with rotation before translation."""
     n = len(points)
     pixels, by_camera, by_point = np.empty((n, 2)), np.empty((n, 2, 6)), np.empty((n, 2, 3))
     for i in range(n):

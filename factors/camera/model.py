@@ -88,8 +88,7 @@ class CameraModel:
         return len(self.distortion) == 4 and not self.fisheye
 
     def calibration(self) -> gtsam.Cal3DS2:
-        """Return focal lengths, principal point and distortion as a GTSAM object. The lens must satisfy
-        :attr:`is_brown`."""
+        """Return intrinsics and distortion as a GTSAM object. The lens must satisfy :attr:`is_brown`."""
         return gtsam.Cal3DS2(self.fx, self.fy, 0.0, self.cx, self.cy, *self.distortion)
 
     def contains(self, pixels: Array, margin: float = 0.0) -> Any:
@@ -236,8 +235,7 @@ def by_tilt(model: CameraModel, by_parameters: Array) -> Array:
 def linearize_in_space(
     model: CameraModel, position: Array, rotation: Array, points: Array
 ) -> tuple[Array, Array, Array]:
-    """Predict the pixels of world ``points`` (K, 3) in a camera at ``position`` (3,) with ``rotation`` (3, 3), with
-    derivatives.
+    """Predict the pixels of world ``points`` (K, 3) in a camera at ``position`` (3,) with ``rotation`` (3, 3).
 
     Returns the pixels (K, 2) and their Jacobians by the camera's perturbation (K, 2, 6) and by the points (K, 2, 3).
     The perturbation is in the camera frame with rotation before translation, as in ``gtsam.Pose3``.

@@ -67,8 +67,7 @@ class PointFactor:
         return residual, blocks
 
     def cost(self, values: Sequence[Array]) -> float:
-        """Return the robust loss of the pixel. ``values``: pose, constants, roll and pitch, and point, see the
-        class."""
+        """Return the robust loss of the pixel. ``values``: pose, constants, roll and pitch, point, see the class."""
         return float(huber_loss(_linearize_all([self], [values])[2], self.model.robust).sum())
 
     def is_astray(self, values: Sequence[Array]) -> bool:

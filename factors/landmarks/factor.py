@@ -123,7 +123,7 @@ class BearingRangeFactor:
         return _places(self.estimated)
 
     def cost(self, values: Sequence[Array]) -> float:
-        """Return the robust loss, summed over the landmarks. ``values``: pose, constants, bias, position, see the
+        """Return the sum of robust losses of all landmarks. ``values``: pose, constants, bias, position, see the
         class."""
         error, _, slopes = self._linearized(values)
         return float(losses.loss(self.model.packed, error, slopes))

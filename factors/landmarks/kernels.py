@@ -36,14 +36,13 @@ Sighting = tuple[Array, Array, Array, bool, Array, bool, Array, float, bool, Arr
 
 @compiled
 def linearize(model: Array, pose: Array, changes: Array, packed: Sighting, error: Array, jacobian: Array) -> None:
-    """Linearise one measurement of K landmarks. It gives the result of
-    :meth:`factors.landmarks.factor.BearingRangeFactor.whitened`.
+    """Linearise one measurement of K landmarks, as :meth:`factors.landmarks.factor.BearingRangeFactor.whitened` does.
 
-    ``model`` (14,): the array ``packed`` of a :class:`~factors.landmarks.model.BearingRangeModel`. ``pose`` (3,): the
-    robot pose.
-    ``changes`` (6,): corrections of the sensor constants. ``packed``: the measurement as a tuple, see :data:`Sighting`.
+    ``model`` (14,): the array ``packed`` of a :class:`~factors.landmarks.model.BearingRangeModel`. ``pose`` (3,): of
+    the robot. ``changes`` (6,): corrections of the sensor constants. ``packed``: the measurement, see :data:`Sighting`.
     ``error`` (K, 2): output, the whitened residual. Must contain zeros before the call.
-    ``jacobian`` (K, 2, WIDTH): output, its Jacobian. Must contain zeros before the call.
+    ``jacobian`` (K, 2, WIDTH): output, its Jacobian by pose, landmark and constants. Must contain zeros before the
+    call.
     """
     points, ranges, bearings, displaced, offset, widened, covariance, count, moves, twist, surveys = packed
     x, y, turned = offset[0], offset[1], offset[2]

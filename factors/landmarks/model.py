@@ -102,8 +102,7 @@ def located(model: BearingRangeModel, ranges: Array, bearings: Array) -> Array:
 
 
 def sigmas(model: BearingRangeModel, ranges: Array) -> Array:
-    """Return the standard deviations (K, 2) [m, rad] of range and bearing at measured ``ranges`` (K,). NaN counts as 0
-    m."""
+    """Return the standard deviations (K, 2) [m, rad] of range and bearing at ``ranges`` (K,). NaN counts as 0 m."""
     ranges = np.where(np.isnan(ranges), 0.0, ranges)
     out = np.empty((len(ranges), 2))
     out[:, 0] = np.hypot(model.range_sigma, model.range_sigma_relative * ranges)
@@ -113,7 +112,7 @@ def sigmas(model: BearingRangeModel, ranges: Array) -> Array:
 
 def residuals(model: BearingRangeModel, poses: Array, points: Array, ranges: Array, bearings: Array) -> Array:
     """Return the whitened residuals (..., K, 2) of range and bearing to K points (K, 2), predicted minus measured.
-    ``poses``: (..., 1, 3) or (3,). ``ranges``, ``bearings`` (K,): measured. It is zero if they are NaN."""
+    ``poses``: (..., 1, 3) or (3,). ``ranges``, ``bearings`` (K,): if a measurement is NaN, its residual is zero."""
     expected_range, expected_bearing = predict(model, poses, points)
     sigma = sigmas(model, ranges)
     error = np.empty((*np.shape(expected_range), 2))

@@ -26,7 +26,8 @@ from factors.se2 import Array
 class LoopFactor:
     """A loop closure as a robust factor on two poses.
 
-    ``measured`` (3,): the later pose in the frame of the earlier pose. None if only the positions are equal.
+    ``measured`` (3,): the later pose in the frame of the earlier pose. None if the loop closure only states that both
+    positions are equal.
     ``sigmas``: standard deviations (3,) [m, m, rad] of the body-frame perturbation of ``measured``. If ``measured`` is
     None, the standard deviation (1,) [m] of each coordinate of the difference of the positions.
     ``offset``: the motion from the later estimated pose to the pose at the time of the loop closure. Its covariance is
@@ -44,12 +45,12 @@ class LoopFactor:
 
     @property
     def rows(self) -> int:
-        """The number of residuals: 3, or 2 if only the positions are known to be equal."""
+        """The number of residuals: 3, or 2 if the loop closure only states that both positions are equal."""
         return 2 if self.measured is None else 3
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Return the whitened residual (2,) or (3,) with robust weight, and its Jacobians by the later and earlier
-        pose."""
+        """Return the whitened residual (2,) or (3,) with robust weight, and a list of its Jacobians by the two
+        poses."""
         error, by_later, by_earlier = self.whitened(values)
         weight = math.sqrt(geman_mcclure_weight(float(error @ error), self.robust))
         return weight * error, [weight * by_later, weight * by_earlier]
@@ -83,8 +84,7 @@ class LoopFactor:
         return replace(self, robust=width * self.robust)
 
     def convex_width(self, values: Sequence[Array]) -> float:
-        """Return the smallest ``width`` of :meth:`widened`, at least 1, that makes the loss convex at these
-        ``values``."""
+        """Return the smallest ``width`` >= 1 of :meth:`widened` that makes the loss convex at these two poses."""
         error, _, _ = self.whitened(values)
         return max(1.0, math.sqrt(3.0) * float(np.linalg.norm(error)) / self.robust)
 

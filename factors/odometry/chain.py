@@ -117,8 +117,7 @@ class OdometryChain:
         return self._insert(t, GYRO, w, 0.0, 0.0, 0.0)
 
     def add_velocities(self, t: Array, v: Array, w: Array) -> int:
-        """Add N velocities (N,) as :meth:`add_velocity` does, in order of time. Returns the number that were not too
-        old."""
+        """Add N velocities (N,) as :meth:`add_velocity` does, in order of time. Returns the number of added ones."""
         if not len(t):
             return 0
         self._reserve(len(t))
@@ -228,8 +227,7 @@ class OdometryChain:
     def moved(
         self, start: ChainState, times: Sequence[float], pose: Array, covariance: Array, constants: Array
     ) -> tuple[Array, Array, Array, Array]:
-        """Predict a pose (3,) with body-frame ``covariance`` (3, 3) from the odometry state ``start`` to K ``times``
-        [s].
+        """Predict a pose (3,) with body-frame ``covariance`` (3, 3) from the odometry state ``start`` to K ``times``.
 
         ``constants`` (P,): corrections of the estimated odometry constants. Returns four arrays: the odometry states
         (K, 8), see :class:`ChainState`; the poses (K, 3); their body-frame covariances (K, 3, 3); their covariances (K,

@@ -131,8 +131,8 @@ class ScaleFreeOdometryFactor(OdometryFactor):
 
 @compiled
 def whitener(covariance: Array) -> Array:
-    """Return the inverse (3, 3) of the lower Cholesky factor of a covariance (3, 3). Its diagonal is kept above a
-    minimum, because of rounding."""
+    """Return the inverse (3, 3) of the lower Cholesky factor of a covariance (3, 3). Diagonal elements of the factor
+    that are too small because of rounding are raised."""
     a = math.sqrt(covariance[0, 0])
     b, c = covariance[1, 0] / a, covariance[2, 0] / a
     d = math.sqrt(max(covariance[1, 1] - b * b, ROUNDING * covariance[1, 1]))

@@ -41,8 +41,7 @@ class PositionFactor:
         return np.asarray(se2.transform_from(poses, self.point) - self.position)
 
     def linearized(self, poses: Array) -> tuple[Array, Array]:
-        """Return whitened residuals (N, 2) at poses (N, 3), and their Jacobians (N, 2, 3) by body-frame
-        perturbations."""
+        """Return whitened residuals (N, 2) at poses (N, 3), and their body-frame Jacobians (N, 2, 3) by the poses."""
         point, axes = self.point, _axes(poses[:, 2])
         jacobian = axes @ np.array(((1.0, 0.0, -point[1]), (0.0, 1.0, point[0])))
         whitener = positive.whitener(self._covariances(poses))

@@ -110,8 +110,8 @@ class TagReadCounts:
 
 
 def merged(parts: list[TagReadCounts]) -> TagReadCounts:
-    """Merge counts with the same reference pose. ``parts``: counts in order of time. The ``odds`` of a tag are those of
-    the first part that lists the tag. The values ``elsewhere`` of a tag are added."""
+    """Merge counts with the same reference pose into one. ``parts``: counts in order of time. The ``odds`` of a tag are
+    those of the first part that lists the tag. The values ``elsewhere`` of a tag are added."""
     first = parts[0]
     if len(parts) == 1:
         return first

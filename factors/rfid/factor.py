@@ -124,7 +124,7 @@ class RfidFactor:
         return self.likelihood.joint_score(values[0], self._parameters(values[1]), self.reads, self.estimated)
 
     def log_likelihood(self, poses: Array, values: Array | None = None) -> Array:
-        """Return the tempered log-likelihood (N,) of poses (N, 3). ``values`` (N, P): the parameters of each pose, or
+        """Return the tempered log-likelihood (N,) of poses (N, 3). ``values`` (N, P): parameters of each pose, or
         None."""
         if values is None:
             return self.likelihood.log_likelihood(poses, self.reads)

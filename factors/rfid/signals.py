@@ -161,8 +161,7 @@ class PhaseModel:
 @dataclass(frozen=True)
 class RssiModel:
     """The model of signal strengths at ``antennas``, linear in :data:`FEATURES` with ``coefficients`` (6,). ``sigma``
-    [dB], ``dof``: scale and degrees of freedom of the Student density of errors. ``tempering``: exponent of the
-    likelihood."""
+    [dB], ``dof``: scale and degrees of freedom of the Student density of errors. ``tempering``: likelihood exponent."""
 
     antennas: tuple[Antenna, ...]
     coefficients: Sequence[float]

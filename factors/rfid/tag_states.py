@@ -153,8 +153,7 @@ class TagStates:
 
     def forget(self, since: float) -> None:
         """Undo :meth:`learn` for all scans since the time ``since`` [s], except those more than :data:`KEPT` seconds
-        before the newest. Call this if the robot's pose was wrong in these scans, or before they are processed
-        again."""
+        before the newest. Call this if the robot's pose was wrong in these scans, or to process them again."""
         kept: deque[tuple[float, Integers, NDArray[np.float32]]] = deque()
         for row in self._evidence:
             if row[0] < since:

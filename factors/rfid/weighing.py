@@ -198,8 +198,7 @@ def weigh_tag(
     product: Array,
     room: Array,
 ) -> None:
-    """Write the log-likelihood of tag number ``t`` at N poses into ``own`` (N,), relative to that of a tag out of
-    reach.
+    """Write the log-likelihood of tag ``t`` at N poses into ``own`` (N,), relative to that of a tag out of reach.
 
     ``at``, ``models``, ``measured``: as in :func:`place_antennas`. ``tags``: from :func:`tags_of_tables`. ``count``: N.
     ``matters`` (K,): a mask of measurements to evaluate. ``product``, ``room`` (N,): working memory.
