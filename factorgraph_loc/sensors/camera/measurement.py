@@ -148,8 +148,8 @@ def make_images(table: TableRows, t0_ns: int, warnings: list[Notice], folder: Pa
     """Return the stream of the images that ``table`` lists. If images have the same timestamp, only the last is kept.
 
     ``t0_ns``: the absolute time of t = 0 [ns]. ``warnings``: a list to append a warning about missing images to.
-    ``folder``: the folder of the images, by default ``camera`` next to the table. Raises InputError if a path is
-    outside of the folder or is no file, and if a timestamp is more than 0.5 s before an earlier row.
+    ``folder``: the folder of the images, by default ``camera`` next to the table. Raises InputError for a path outside
+    of the folder and a path that is no file. Raises InputError if timestamps decrease by more than 0.5 s.
     """
     latest = checks.last_in_order(table.path, table.rows, table.t_ns, warnings, rules=table.rules).tolist()
     within = inside(table.path.parent, FOLDER, table.path) if folder is None else folder
