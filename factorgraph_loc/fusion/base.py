@@ -53,7 +53,8 @@ class Estimator(Protocol):
         [s]. It has Gaussian modes, and particles if the estimator uses them."""
 
     def learnt(self) -> Learnt:
-        """Return the estimates of sensor constants and landmarks from all measurements."""
+        """Return the sensor constants and landmarks that are estimated from all measurements so far, with standard
+        deviations or covariances."""
 
     def trajectory(self) -> Trajectory:
         """Return the best estimates of all past poses with covariances, at the times at which the run recorded the
@@ -71,7 +72,8 @@ class ConcludingEstimator(Protocol):
 
 @runtime_checkable
 class ForgettingEstimator(Protocol):
-    """An estimator whose memory can be limited, for runs of unlimited length."""
+    """An estimator that can delete old parts of its trajectory, so that runs of unlimited length need limited
+    memory."""
 
     def forget(self, until: float) -> None:
         """Delete the trajectory before the time ``until`` [s], except for the part that late measurements can still change."""

@@ -77,8 +77,8 @@ class _State(NamedTuple):
         return self._replace(rest=self.rest[: size - POSE], covariance=self.covariance[:size, :size])
 
     def on_pose(self, observation: Observation) -> Observation:
-        """Return the observation as a function of the pose only. Constants and landmarks are fixed at this state, and
-        their covariances are added to the noise."""
+        """Return an observation of this state as a function of the pose only. Constants and landmarks are fixed at
+        their values in this state, and their covariances are added to the noise."""
         values, columns = self.layout.values(self.rest), self.layout.columns
         spreads = {name: self.covariance[columns[name], columns[name]] for name in observation.blocks}
         return observation.on_pose({name: values[name] for name in spreads}, spreads)
@@ -106,7 +106,8 @@ class _Step(NamedTuple):
 
 
 class _Record(NamedTuple):
-    """The updated state at time ``t`` [s], and the prediction ``step`` from the previous record to it."""
+    """A record of the filter at time ``t`` [s]. ``step``: the prediction from the previous record. ``updated``: the
+    state after all updates at this time."""
 
     t: float
     step: _Step

@@ -120,7 +120,8 @@ class Filter(Timeline):
         self._taken.clear()
 
     def _wait(self, t: float) -> None:
-        """Begin at time ``t`` [s] without a state. :meth:`_begin` processes the measurements until the filter has a state."""
+        """Reset the filter to wait for a start at or after time ``t`` [s]. :meth:`_begin` then processes the
+        measurements."""
         self._t, self._begun, self._state = t, math.inf, None
         self._taken.clear()
 
@@ -195,8 +196,8 @@ class Filter(Timeline):
         return ahead
 
     def _anchor(self) -> None:
-        """Store the integrated odometry at the start. This is called at the first measurement after the start, because
-        then all odometry from before the start has arrived."""
+        """Store the integrated odometry at the time of the start. Call this at the first measurement after the start,
+        when all odometry from before the start has arrived."""
         if not self._moves:
             self._odometry, self._moves = self._motion.state(self._t), True
 

@@ -148,8 +148,8 @@ def _positive(covariance: Array, where: str = "") -> Array:
 
 
 def nearest_positive(covariance: Array) -> Array | None:
-    """Return a symmetric and positive definite covariance (D, D) unchanged. If rounding errors have made it asymmetric
-    or indefinite, return the nearest symmetric and positive definite matrix. Otherwise return None."""
+    """Return the symmetric and positive definite matrix nearest to a covariance (D, D). Only rounding errors are
+    repaired: returns None if the covariance is more indefinite."""
     sigmas = np.sqrt(np.diag(covariance))
     if not (np.all(np.isfinite(covariance)) and np.all(sigmas > 0.0)):
         return None

@@ -44,7 +44,8 @@ class Layout:
         return columns
 
     def plus(self, name: str, size: int) -> Layout:
-        """Return the layout with one more block at the end. ``size``: its number of components."""
+        """Return the layout with one more block at the end. ``name``: of its sensor or landmark. ``size``: its number
+        of components."""
         return Layout({**self.sizes, name: size})
 
     def values(self, rest: Array) -> dict[str, Array]:

@@ -318,7 +318,7 @@ class ParticleFilter(Filter):
             self._state = self._sampled_cloud(self._t) or self._state
 
     def _doubt(self, m: Measurement) -> None:
-        """Check whether the observations contradict the particles. If they do, draw particles from the search."""
+        """Check whether observations contradict the particles. If they do, draw new ones from a global search."""
         view = _CloudView(self)
         refuted = self._search.refuted(m, view.track, view.pose_back)
         if refuted is not None:

@@ -196,7 +196,8 @@ class Population:
         return float(self._cloud.weights[near].sum()) < NEGLIGIBLE
 
     def _processed(self, new: WeighedObservation) -> Steps[None]:
-        """Predict the particles to the time of the observation ``new`` and weigh them by it, in steps."""
+        """Return a generator that predicts the particles to the time of the observation ``new`` and weighs them by it.
+        It yields the computing cost of each part."""
         odometry, observation = new.odometry, new.observation
         if self._cloud is None or self.newest is None:
             count = int(np.clip(DENSITY * self._volume, FEWEST_AT_FIRST, MOST))
@@ -291,7 +292,8 @@ def _cloud(poses: Array, log_weights: Array) -> Cloud:
 
 
 def _likelihood(observation: Evidence, cloud: Cloud) -> Steps[Array]:
-    """Return the log-likelihood (N,) of an observation at the particles of ``cloud``, in steps of about equal cost."""
+    """Return a generator that computes the log-likelihood (N,) of an observation at the particles of ``cloud``. It
+    yields the computing cost of each part, about the same for all parts."""
     each = PARTICLE + observation.work
     count = max(1, CHUNK // each)
     parts = []

@@ -66,7 +66,7 @@ class Search:
 
     @property
     def possible(self) -> bool:
-        """True if the sensors can determine a pose."""
+        """True if the sensors of the search can determine a pose."""
         return bool(self._finders) or self._weighs
 
     def serves(self, sensor: Sensor) -> bool:

@@ -107,7 +107,7 @@ class Timeline(ABC):
         """Process a measurement that is not too late, after the start."""
 
     def _renew(self, m: Measurement) -> None:
-        """Discard cached results of earlier requests, because a measurement arrives."""
+        """Discard cached results. Called when a measurement arrives."""
         return
 
     def _uses(self, m: Measurement) -> bool:

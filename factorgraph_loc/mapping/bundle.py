@@ -197,8 +197,8 @@ def _optimized(
 
 
 def _sparse(blocks: Array, rows: Integers, columns: Integers, shape: tuple[int, int]) -> Any:
-    """Return the sparse matrix of ``shape`` with ``blocks`` (N, r, c) at the block rows ``rows`` (N,) and block columns
-    ``columns`` (N,). Blocks at the same place are added."""
+    """Return a sparse block matrix of ``shape``. ``blocks`` (N, r, c): its blocks. ``rows``, ``columns`` (N,): their
+    block rows and block columns. Blocks at the same place are added."""
     _, height, width = blocks.shape
     i = np.broadcast_to(height * rows[:, None, None] + np.arange(height)[:, None], blocks.shape)
     j = np.broadcast_to(width * columns[:, None, None] + np.arange(width), blocks.shape)

@@ -93,7 +93,7 @@ class LandmarkMap:
 
     @property
     def unseen(self) -> tuple[str, ...]:
-        """Names of the given landmarks without measurements. The new map has their given positions."""
+        """Names of the given landmarks without measurements in the log. The new map has their given positions."""
         return tuple(entry.landmark for entry in self.entries if entry.verdict == UNSEEN)
 
     @property
@@ -217,7 +217,7 @@ def align_robustly(points: list[LearntPoint], targets: Array, surveys: Array) ->
 
 
 def _pairs(count: int) -> list[list[int]]:
-    """Return all pairs of ``count`` indices, or ``MAX_PAIRS`` random pairs if there are more."""
+    """Return all pairs of indices below ``count``, or ``MAX_PAIRS`` random pairs if there are more."""
     if count * (count - 1) // 2 <= MAX_PAIRS:
         return [list(pair) for pair in combinations(range(count), 2)]
     rng = np.random.default_rng(0)
@@ -307,5 +307,5 @@ def _assemble(
 
 
 def _natural(name: str) -> tuple[int, str]:
-    """Return a sort key for names: numbers by value (10 after 9), then all other names."""
+    """Return a key to sort names: numbers first by value (10 after 9), then all other names."""
     return (int(name), "") if name.isdecimal() else (10**9, name)

@@ -174,8 +174,8 @@ def map_points(
 
 
 def chosen_keyframes(posed: PosedFrames, settings: PointSettings) -> Integers:
-    """Return the indices of the frames that become keyframes. They are at least ``settings.distance`` or
-    ``settings.angle`` apart. Both limits are increased until there are at most :data:`MOST_KEYFRAMES`."""
+    """Return the indices of the images that become keyframes. They differ by at least ``settings.distance`` or
+    ``settings.angle``. Both limits are increased until there are at most :data:`MOST_KEYFRAMES`."""
     filled = np.flatnonzero([len(frame.pixels) > 0 for frame in posed.frames])
     distance, angle = settings.distance, settings.angle
     while True:

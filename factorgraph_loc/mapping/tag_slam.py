@@ -71,8 +71,8 @@ class TagObservations:
     has_height: NDArray[np.bool_]
 
     def along(self, poses: Array, which: NDArray[np.bool_] | slice = slice(None)) -> TagReadCounts:
-        """Return the read counts of the L selected observations. ``which``: mask (K,) that selects them, or a slice.
-        ``poses`` (L, 3): the robot poses at the times of the selected observations, in the world frame."""
+        """Return the read counts of L selected observations, with robot poses. ``which``: mask (K,) that selects them,
+        or a slice. ``poses`` (L, 3): the robot poses at the times of the selected observations, in the world frame."""
         return TagReadCounts(poses, self.antennas[which], self.rounds[which], self.hits[which])
 
 
@@ -210,7 +210,7 @@ class _Problem:
         self._count = 1
 
     def extend(self, count: int) -> None:
-        """Add keyframes until there are ``count``, with poses predicted by odometry."""
+        """Add keyframes until there are ``count``. Their poses are predicted by odometry."""
         for i in range(self._count, count):
             step = self._recalibrated(self._steps[i - 1])
             self._values[pose_key(i)] = se2.compose(self._values[pose_key(i - 1)], step)

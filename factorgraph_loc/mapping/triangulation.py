@@ -92,8 +92,8 @@ class Triangulated:
     parallax: Array
 
     def good(self, tracks: Tracks, model: CameraModel, parallax: float = PARALLAX) -> Truths:
-        """Return a mask (T,) of the good points. A good point has two or more observations, an allowed depth in all
-        cameras, small residuals, and a parallax of at least ``parallax`` [rad]."""
+        """Return a mask (T,) of the points that are reliable. They have two or more observations, an allowed depth in
+        all cameras, small residuals, and a parallax of at least ``parallax`` [rad]."""
         invalid = (self.depths < NEAREST) | (self.depths > FARTHEST)
         square = np.bincount(tracks.track, np.sum(self.errors**2, axis=1), minlength=tracks.count)
         rms = np.sqrt(square / np.maximum(tracks.lengths(), 1))

@@ -158,9 +158,11 @@ def dense(corners: Array, spacing: float = SPACING) -> Array:
 
 
 def _graph(index: NDArray[np.int64]) -> sparse.csr_matrix:
-    """Return the distances (K, K) [m] between neighbouring free cells, as a sparse matrix.
+    """Return the distances (K, K) [m] between neighbouring free cells, as a sparse matrix. ``index``: see
+    :class:`FreeSpace`.
 
-    A cell has up to eight neighbours. A diagonal neighbour counts only if both cells next to the diagonal are free.
+    A cell has up to eight neighbours. A diagonal neighbour is included only if both cells next to the diagonal are
+    free.
     """
     rows, columns, weights = [], [], []
     for dx, dy in ((1, 0), (0, 1), (1, 1), (1, -1)):

@@ -79,7 +79,8 @@ def corner_names(marker: str) -> list[str]:
 
 
 def marker_of(point: str) -> str | None:
-    """Return the name of the marker that has the map point named ``point`` as a corner, None if none has."""
+    """Return the name of the marker with a corner called ``point``, a point of the map. Returns None if there is
+    none."""
     marker, _, corner = point.rpartition("/")
     is_corner = corner in CORNER_NUMBERS and marker.rpartition("-")[0] in get_args(MarkerFamily)
     return marker if is_corner else None

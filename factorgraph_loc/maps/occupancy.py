@@ -68,7 +68,7 @@ def read_walls(path: Path) -> tuple[Wall, ...]:
 
 
 def _occupied(path: Path, stated: MapFile) -> NDArray[np.bool_]:
-    """Return a mask (rows, columns) of the occupied cells of the image ``path``. A transparent cell counts as not occupied."""
+    """Return a mask (rows, columns) of the occupied cells of the image ``path``. Transparent cells are not occupied."""
     with opened(path, IMAGE) as file, pillow_image(file, path) as image:
         # the grey level of a colour is the mean of its channels, as in map_server
         mode = "RGBA" if "A" in image.getbands() or "transparency" in image.info else "RGB"

@@ -86,7 +86,7 @@ class Diagnostics:
             self.added.append((self.residuals, name, rows))
 
     def event(self, t: float, kind: str, sentence: str, **fields: Any) -> None:
-        """Record an event at time ``t`` [s]. An event that is already recorded is not recorded again.
+        """Record an event at time ``t`` [s], unless it is already recorded.
 
         ``kind``: the type of the event. ``sentence``: its text, with names of ``fields`` in braces.
         """

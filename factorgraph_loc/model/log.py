@@ -136,7 +136,8 @@ class Log:
 
 
 def _pieces(rows: Rows, late: Integers, first: int, last: int) -> Iterator[Rows]:
-    """Yield ``rows`` from index ``first`` to before ``last`` in parts. A row with an index in ``late`` is a part alone."""
+    """Yield ``rows`` from index ``first`` to before ``last`` in parts. Each row with an index in ``late`` is a part of
+    its own."""
     for i in late[late.searchsorted(first) : late.searchsorted(last)].tolist() if len(late) else ():
         if first < i:
             yield rows.part(first, i)

@@ -58,7 +58,7 @@ def named(m: Measurement) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """A time ``t`` [s] at which a run records the causal estimate. Estimators process it like a measurement."""
+    """A time ``t`` [s] at which a run records the estimate. Estimators process it like a measurement."""
 
     sensor: ClassVar[str] = "tick"
     modality: ClassVar[str] = "tick"
@@ -72,7 +72,7 @@ class Tick:
 class Rows:
     """N successive measurements of one stream, joined to one measurement with the time of the last.
 
-    ``kind``: the class of the measurements. ``times`` (N,): their times [s]. ``values``: for each field, its values (N,).
+    ``kind``: the class of the measurements. ``times`` (N,): their times [s]. ``values``: an array (N,) per field.
     """
 
     kind: type[Any]

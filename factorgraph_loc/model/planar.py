@@ -27,7 +27,7 @@ Angle = Annotated[float, Field(ge=-2.0 * math.pi, le=2.0 * math.pi), InUnit("rad
 
 
 def _matrix(text: str) -> Array:
-    """Return the matrix with the axes in ``text``, such as "z -x -y", as rows. It is (3, 3) if there are three axes."""
+    """Return the axes in ``text``, such as "z -x -y", as rows of a matrix. It is (3, 3) if there are three axes."""
     signs = NAMED.get(text, text).split()
     return np.array(
         [[(1.0 - 2.0 * s.startswith("-")) * (s.removeprefix("-") == axis) for axis in "xyz"] for s in signs]

@@ -64,7 +64,8 @@ def check_tick_gap(gap: float) -> None:
 
 
 def check_prior(prior: str | None) -> None:
-    """Raise InputError if ``prior`` is neither the name of a start, such as ``reference``, nor a pose ``X,Y,HEADING``."""
+    """Raise InputError if ``prior`` is neither the name of a start, such as ``reference``, nor a pose
+    ``X,Y,HEADING``."""
     if prior is not None and prior not in NAMED_PRIORS:
         parse_position(prior)
 

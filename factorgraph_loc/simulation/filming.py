@@ -85,8 +85,8 @@ class Film:
 
 
 def film(settings: SimulationSettings, seed: int) -> Film:
-    """Return the images of a simulated drive. :func:`~factorgraph_loc.simulation.simulate` simulates the same drive
-    with the same settings and seed.
+    """Return the images of a simulated drive. :func:`~factorgraph_loc.simulation.simulate` returns the log of the same
+    drive for the same settings and seed.
 
     Raises InputError if the rig has no camera, or if the camera is higher than the furniture.
     """
@@ -116,11 +116,11 @@ def with_images(
     workers: int = 1,
     progress: Callable[[float, float], None] = lambda _done, _total: None,
 ) -> Log:
-    """Render the images of a simulated log into files. Returns the log with these images.
+    """Return a simulated log with images, which are rendered into files.
 
     ``log``: the log that was simulated with the same ``settings`` and ``seed``. ``folder``: receives the image files.
     ``workers``: the number of processes. ``progress``: is called with the number of finished images and the number of
-    all images. Raises InputError as :func:`film` does.
+    all images. Raises InputError if the rig has no camera, or if the camera is higher than the furniture.
     """
     assert log.reference is not None, "a simulated log has a reference"
     times = times_of(settings.images.rate, log.reference)

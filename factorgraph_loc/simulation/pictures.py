@@ -45,7 +45,7 @@ def clouds(rng: np.random.Generator, height: int, width: int, cell: float) -> ND
 
 
 def shaded(canvas: Canvas, factor: NDArray[np.float32]) -> Canvas:
-    """Return a picture multiplied by ``factor`` (H, W)."""
+    """Return a picture with each pixel multiplied by its ``factor`` (H, W)."""
     out = np.empty_like(canvas)
     for i in range(0, len(canvas), 256):  # in strips, to limit the memory
         out[i : i + 256] = np.clip(canvas[i : i + 256] * factor[i : i + 256, :, None], 0.0, 255.0)

@@ -54,10 +54,10 @@ class Surroundings(NamedTuple):
 
 @compiled(error_model="numpy")
 def surroundings(faces: Array, bottoms: Array, tops: Array, origin: Array, size: Array) -> Surroundings:
-    """Return the faces that are visible from the camera position ``origin`` (3,).
+    """Return the faces that are visible from the camera position ``origin`` (3,) [m].
 
-    ``faces`` (F, 4), ``bottoms`` (F,), ``tops`` (F,): all faces of the building and their heights. ``size``: see
-    :class:`Surroundings`.
+    ``faces`` (F, 4): all faces of the building as segments (x1, y1, x2, y2) [m]. ``bottoms``, ``tops`` (F,) [m]: their
+    heights. ``size`` (5,): see :class:`Surroundings`.
     """
     table = np.empty((len(faces), 13))
     lows, highs = np.empty(len(faces)), np.empty(len(faces))

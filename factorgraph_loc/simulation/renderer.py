@@ -101,7 +101,7 @@ def make_scene(plan: Plan, tags: Sequence[Tag], rng: np.random.Generator) -> Tex
 
 
 def _places(tags: Sequence[Tag], face: Array) -> Iterator[tuple[float, float]]:
-    """Yield the position of each tag on a face: the distance [m] from the end that is left for the viewer, and the height [m]."""
+    """Yield (x, z) [m] of each tag on a face. x: the distance from the viewer's left end. z: the height."""
     along = face[2:] - face[:2]
     length = math.hypot(*along)
     along = along / length

@@ -50,7 +50,8 @@ START_SIGMAS = np.array((0.1, 0.1, 0.05))  # m, m, rad: standard deviations of t
 
 
 def generator(seed: int | Any, name: str, names: tuple[str, ...] = NAMES) -> np.random.Generator:
-    """Return the random generator called ``name``. Generators with different names are independent.
+    """Return a random generator that depends only on ``seed`` and ``name``. Generators with different names are
+    independent.
 
     ``seed``: a number, or the seed sequence of another generator. The index of ``name`` in ``names`` is part of the
     seed, or the hash of ``name`` if it is not in ``names``.

@@ -47,7 +47,8 @@ def wall(rng: np.random.Generator, height: int, width: int, texel: float, *, win
 
 
 def lintel(rng: np.random.Generator, height: int, width: int, texel: float) -> Canvas:
-    """Return the texture of the wall above a door, with a plate and the upper edge of the door frame."""
+    """Return the texture of the wall above a door, with a plate and the upper edge of the door frame. ``height``,
+    ``width``: in texels (pixels of a texture). ``texel`` [m]: their size."""
     out = _painted(rng, height, width, texel)
     plate = pictures.sign(rng, max(height // 3, 8), max(width // 2, 16))
     _paste_with_shadow(out, plate, width // 4, height // 3)
@@ -56,13 +57,14 @@ def lintel(rng: np.random.Generator, height: int, width: int, texel: float) -> C
 
 
 def furniture(rng: np.random.Generator, height: int, width: int) -> Canvas:
-    """Return the texture of one side of a cupboard or book shelf."""
+    """Return the texture (height, width, 3) of one side of a cupboard or book shelf."""
     draw = pictures.books if rng.random() < 0.5 else pictures.cupboard
     return draw(rng, height, width)
 
 
 def floor(rng: np.random.Generator, height: int, width: int, texel: float) -> Canvas:
-    """Return the texture of a floor: carpet tiles of a few shades, with threads, stains and scraps."""
+    """Return the texture (height, width, 3) of a floor: carpet tiles of a few shades, with threads and stains.
+    ``texel`` [m]: the size of a pixel of the texture."""
     shade = np.array(_dull(rng))
     shades = shade * rng.uniform(0.75, 1.25, (4, 1)) + rng.uniform(-8.0, 8.0, (4, 3))
     side = round(TILE / texel)
@@ -87,7 +89,8 @@ def floor(rng: np.random.Generator, height: int, width: int, texel: float) -> Ca
 
 
 def ceiling(rng: np.random.Generator, height: int, width: int, texel: float) -> Canvas:
-    """Return the texture of a ceiling: a grid of plain panels, lamps, vents and panels with stains."""
+    """Return the texture (height, width, 3) of a ceiling: panels, some with stains, lamps and vents. ``texel`` [m]: the
+    size of a pixel of the texture."""
     out = pictures.shaded(pictures.filled(height, width, (196, 202, 202)), 1.0 + 0.02 * _grain(rng, height, width))
     side = round(TILE / texel)
     for y in range(0, height, side):
@@ -107,7 +110,7 @@ def ceiling(rng: np.random.Generator, height: int, width: int, texel: float) -> 
 
 
 def label(rng: np.random.Generator, texel: float) -> Canvas:
-    """Return the texture of an RFID tag: a white label with its antenna."""
+    """Return the texture of an RFID tag: a white label with its antenna. ``texel`` [m]: the size of its pixels."""
     width, height = round(0.1 / texel), round(0.04 / texel)
     out = pictures.filled(height, width, pictures.PAPER)
     out[height // 2, 2:-2] = pictures.INK

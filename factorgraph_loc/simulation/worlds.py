@@ -48,7 +48,7 @@ class Plan:
     hanging: tuple[tuple[float, float], ...] = ()
 
     def segments(self) -> Array:
-        """Return all segments (S, 4) that block motion and sight."""
+        """Return all segments (S, 4) of walls and boxes, which block motion and sight."""
         return np.array([*self.walls, *(side for box in self.boxes for side in _sides(box))])
 
     def faces(self) -> tuple[Array, Array]:
@@ -74,7 +74,7 @@ class Plan:
 
 
 def both_sides(segment: Segment) -> tuple[Segment, Segment]:
-    """Return the segment and the reversed segment."""
+    """Return the segment (x1, y1, x2, y2) and the reversed segment (x2, y2, x1, y1)."""
     x1, y1, x2, y2 = segment
     return segment, (x2, y2, x1, y1)
 
@@ -132,7 +132,8 @@ def _furniture(span: tuple[float, float], inner: float, outer: float, rng: np.ra
 
 
 def _shelves(width: float, depth: float) -> tuple[Segment, ...]:
-    """Return rows of shelves along x, with aisles between them. Long rows have a gap in the middle."""
+    """Return rows of shelves along x as boxes (x1, y1, x2, y2), with aisles between them. Long rows have a gap in the
+    middle."""
     rows = max(1, math.floor((depth - AISLE_WIDTH) / (SHELF_DEPTH + AISLE_WIDTH)))
     pitch = (depth - rows * SHELF_DEPTH) / (rows + 1)
     margin = min(AISLE_WIDTH, width / 4.0)

@@ -305,7 +305,8 @@ class KeyframeCameras:
         return KeyframeCamera.of(self._model, pose, slacks[keyframe], graph.values[tilt_key(keyframe)])
 
     def _slacks(self, newest: Keyframe, graph: Graph) -> dict[int, float]:
-        """Return the errors [px] of the last keyframes relative to the newest keyframe, by number of the keyframe."""
+        """Return the errors [px] of the camera poses of the last keyframes relative to the newest one, by number of the
+        keyframe."""
         slacks: dict[int, float] = {}
         # variances of the odometry's rotation: from the newest keyframe back to the last anchored one; from an older
         # keyframe to the next anchored one

@@ -166,7 +166,7 @@ def _is_plausible(guess: Guess, pose: Array, travelled: float) -> bool:
 
 
 def _in_reach(model: CameraModel, camera: CameraPose, points: PointMap) -> Truths:
-    """Return a mask (N,) of the points that may be visible and similar to their stored view.
+    """Return a mask (N,) of the points that may be visible to ``camera``, and may be similar to their stored view.
 
     The pose of ``camera`` may be wrong by :data:`LARGEST_SHIFT` and :data:`LARGEST_TURN`. A point is similar if it is
     observed from about the same direction and distance as in its stored view.

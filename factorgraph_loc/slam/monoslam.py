@@ -255,7 +255,7 @@ class Monoslam(Filter):
 
     def _corrected(self, m: Pixels, prior: SlamState, eye: Eye, match: Match) -> SlamState:
         """Return the state after a Kalman update of ``prior`` with the matched pixels ``match``. In a known map, the
-        update is iterated with Huber weights. The noise of a pixel outside the gate is increased."""
+        update is iterated with Huber weights. The noise of pixels far from their prediction is increased."""
         known = match.mapped, match.points, match.covariances
         zero = np.zeros(len(prior.covariance))
         sights = eye.all(prior, *known)
@@ -291,10 +291,10 @@ class Monoslam(Filter):
             self.diagnostics.add_residuals(f"camera.{name}", residual[:, i].tolist())
 
     def _relocated(self, m: Pixels, state: SlamState, eye: Eye, match: Match) -> tuple[SlamState, bool]:
-        """Relocalize in the whole map if several images had no matches, or if the pose is very uncertain.
+        """Return the state, and True if it was relocalized in the whole map. This is tried if several images had no
+        matches, or if the pose is very uncertain.
 
-        Returns the state, and True if relocalization succeeded. The new state then has no points, because the points
-        belong to the old pose.
+        A relocalized state has no estimated points, because these belong to the old pose.
         """
         lost = state.lost + 1 if match.wanted and not len(match.pixels) else 0
         camera = self._matcher.relocated(m, eye) if lost >= LOST_AFTER or self._is_vague(state) else None

@@ -40,7 +40,7 @@ class RobotState:
     rate: Array
 
     def plus(self, error: Array) -> RobotState:
-        """Return the state perturbed by ``error`` (12,), a vector of the error state."""
+        """Return the state perturbed by ``error`` (12,), in the order rotation, position, velocity, turn rate."""
         return RobotState(
             self.position + self.rotation @ error[SHIFT],
             orthonormal(self.rotation @ exp(error[TURN])),
@@ -68,8 +68,8 @@ class Step:
     noise: Array
 
     def carried(self, covariance: Array) -> Array:
-        """Return the covariance after the step. ``covariance`` (12 + P + D, 12 + P + D): the covariance before the
-        step, of the robot, P constants of the odometry, and D values of points."""
+        """Return the covariance after the step. ``covariance`` (12 + P + D, 12 + P + D): the covariance before it. P is
+        the number of constants of the odometry, and D the number of values of points."""
         known = self.transition.shape[1]
         carried = self.transition @ covariance[:known]
         result = covariance.copy()

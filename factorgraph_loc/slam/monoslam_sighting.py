@@ -70,7 +70,7 @@ def agreeing(residual: Array, innovation: Innovation, noise: Array) -> Truths:
 
 
 def _confirmed(residual: Array, total: Array, right: Truths) -> Truths:
-    """Return the mask ``right`` (K,) of inlier matches after removing outliers, one at a time, the worst first.
+    """Return the mask ``right`` (K,) of inlier matches with outliers set to False, one at a time, the worst first.
 
     An outlier contradicts the pixel predicted from the remaining matches. ``residual`` (K, 2): measured minus predicted
     pixels. ``total`` (2K, 2K): the innovation covariance with noise.

@@ -86,7 +86,7 @@ class SlamState:
 
     @property
     def base(self) -> int:
-        """The number of values of the error state that precede the points."""
+        """The number of components of the error state that precede those of the points."""
         return ROBOT + len(self.constants)
 
     def starts(self) -> Integers:

@@ -192,8 +192,8 @@ class UnknownPoints(Mapper):
         return pose
 
     def _names_of(self, m: Pixels, rows: Sequence[int], camera: CameraPose, graph: Graph) -> list[Hashable]:
-        """Return the name of the point in each row of the image. A point of a feature has the number of its
-        first feature track. Lost points are searched from ``camera``, and keep their name."""
+        """Return the name of the point in each row of the image. A feature has the number of the track that first
+        observed its point. Points that their track has lost are searched from ``camera``, and keep their name."""
         if m.frame is None:
             return [m.names[i] for i in rows]
         tracks = m.frame.tracks[list(rows)].tolist()
@@ -259,8 +259,8 @@ class UnknownPoints(Mapper):
         guess: Guess,
     ) -> None:
         """Store the views of the points ``names`` in the ``rows`` of a frame. ``right``: mask of the inliers.
-        ``keyframe``, ``guess``: key and estimate of the keyframe's pose. If an outlier is not in the point's first
-        track, its track is separated from the point."""
+        ``keyframe``, ``guess``: key and estimate of the keyframe's pose. If an outlier's feature track was joined to
+        the point later, it is separated again."""
         for row, name, agrees in zip(rows, names, right.tolist(), strict=True):
             if agrees:
                 point = self._points[name].key
@@ -284,8 +284,8 @@ class UnknownPoints(Mapper):
         self._new, self._loops = NewPoints(self.model), LoopClosure()
 
     def forget(self, first: Keyframe) -> list[int]:
-        """Delete the data of keyframes before ``first``, and of removed points that were not observed from ``first`` or
-        later. Returns the keys of these points."""
+        """Delete the data of keyframes before ``first``. Also delete removed points that ``first`` and later keyframes
+        do not observe. Returns the keys of these points."""
         forgotten = [point.key for point in self._gone if point.last < first.t]
         self._gone = [point for point in self._gone if point.last >= first.t]
         self._views.forget(forgotten)

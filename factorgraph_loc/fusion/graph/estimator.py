@@ -57,7 +57,8 @@ REPLAYED, TICK = 300, 2  # computing cost of one slice of a replay, and of one t
 
 @dataclass(frozen=True)
 class _Conclusion:
-    """A copy of the graph with its final solution: poses (M, 3) and body-frame covariances (M, 3, 3) of all keyframes."""
+    """The final solution of a graph. ``graph``: a copy of it, with the final values. ``poses`` (M, 3), ``covariances``
+    (M, 3, 3): of all keyframes, covariances in the body frame."""
 
     graph: Graph
     poses: Array
@@ -120,8 +121,8 @@ class Smoother(Timeline):
             self._doubt(m)
 
     def _estimate_at(self, t: float | None) -> PoseEstimate:
-        """Return the newest keyframe's pose, predicted by odometry. With the setting ``final_only``, this is a rough
-        estimate with the status ``unlocalized``."""
+        """Return the newest keyframe's pose, predicted by odometry to the present time or, if later, to ``t`` [s]. With
+        the setting ``final_only``, this is a rough estimate with the status ``unlocalized``."""
         at = self._t if t is None else max(t, self._t)
         pose, _, covariance = self._graph.moved(at)
         return PoseEstimate(at, pose, covariance, self._status(covariance))
@@ -188,8 +189,7 @@ class Smoother(Timeline):
             self._backend.forget(min(until, self._taken_until - self._settings.max_delay))
 
     def _concluded(self) -> _Conclusion:
-        """Return the final solution, on a copy of the graph. The graph itself is not changed, so that later results do
-        not depend on this call."""
+        """Return the final solution, computed on a copy of the graph. The original graph does not change."""
         if self._conclusion is None:
             graph = self._graph.copy()
             graph.newest.nodes += self._builder.waiting()
@@ -274,7 +274,7 @@ class Smoother(Timeline):
         return min((m.t for m in self._behind), default=self._t)
 
     def _catch_up(self) -> None:
-        """Continue the replay of measurements by one slice of fixed computing cost."""
+        """Process some of the stored measurements again, at a fixed computing cost per call."""
         work = REPLAYED
         while self._behind and work > 0:
             m = self._behind.popleft()
@@ -292,8 +292,8 @@ class Batch(Smoother):
 
 
 def _learnt(graph: Graph, poses: Iterable[Array] = (), covariances: Iterable[Array] = ()) -> Learnt:
-    """Return the estimated constants, landmarks and points of a graph. ``poses``, ``covariances``: the final poses (3,)
-    of all keyframes, and their body-frame covariances (3, 3)."""
+    """Return the estimated sensor constants, landmarks and points of a graph. ``poses`` (M, 3), ``covariances`` (M, 3,
+    3): the final poses of all M keyframes and their body-frame covariances."""
     blocks = [(name, graph.values[key], graph.covariances[key]) for name, key in graph.keys.items()]
     numbered = graph.keyframes.values()
     means, bodies = ({k.key: v for k, v in zip(numbered, part)} for part in (poses, covariances))  # noqa: B905

@@ -100,7 +100,7 @@ class Addition:
     values: Values = field(default_factory=dict)
 
     def hang(self, keyframe: Keyframe, *nodes: Node) -> None:
-        """Add factors to this addition and to the factors of ``keyframe``."""
+        """Add the factors ``nodes`` to this object and to the list of factors of ``keyframe``."""
         keyframe.nodes += nodes
         self.nodes += nodes
 
@@ -218,7 +218,7 @@ class Graph:
         self.newest.odometry, self.is_anchored = self.motion.state(self.newest.t), True
 
     def append(self, keyframe: Keyframe) -> None:
-        """Add a keyframe at the end."""
+        """Add a keyframe as the newest one."""
         self.keyframes[keyframe.index] = self.newest = keyframe
 
     def cut(self, first: int, t: float) -> None:
@@ -351,7 +351,7 @@ class Graph:
         return True
 
     def forget_points(self) -> None:
-        """Remove points that the remaining keyframes do not determine. Call this after keyframes were removed."""
+        """Remove points with too few remaining observations. Call this after keyframes were removed."""
         keyframes = self.keyframes.values()
         sightings = Counter(key for k in keyframes for node in k.nodes for key in node.keys if is_point(key))
         if self.mapper.estimates:
@@ -391,7 +391,7 @@ class Graph:
         return f"the measurements do not determine {self._named(key)}"
 
     def _named(self, key: int) -> str:
-        """Return the description of the variable ``key``, for messages."""
+        """Return a text that describes the variable ``key``, for messages."""
         if is_of_keyframe(key):
             return f"the {'pose' if is_pose(key) else 'tilt'} at {self.keyframes[index_of(key)].t:.3f} s"
         if is_point(key):

@@ -138,8 +138,8 @@ class Incremental:
         self._wait(addition, guess)
 
     def _wait(self, addition: Addition, guess: Guess) -> None:
-        """Store the factors and variables of ``addition`` for the next update of the solver. Until then the newest pose
-        is ``guess``."""
+        """Store the factors and variables of ``addition`` for the next update of the solver. Until then the newest
+        estimate is ``guess``, a pose and its covariance."""
         self._waiting.nodes += addition.nodes
         self._waiting.values |= addition.values
         self._graph.pose, self._graph.covariance = guess
@@ -179,9 +179,11 @@ class Incremental:
             self._graph.diagnostics.reject(f"factor: {self._failed.pop()}")
 
     def _read(self, newest: Keyframe, touched: Iterable[int]) -> None:
-        """Read estimates from the solver after an update: the newest pose, and the variables ``touched`` by the update.
+        """Copy estimates from the solver after an update: the newest pose, and the variables ``touched`` (keys) by the
+        update.
 
-        Covariances take time. They are read only for the pose, landmarks, and constants whose covariance a sensor needs.
+        Covariances take time. They are read only for the pose, landmarks, and constants whose covariance a sensor
+        needs.
         """
         graph = self._graph
         newest.causal = graph.pose, graph.covariance = self._marginal(newest.key)
@@ -311,7 +313,7 @@ class Incremental:
         return stamps | {key: k.t for k in keyframes for key in (k.key, tilt_key(k.index)) if key in values}
 
     def _odometry_node(self, keyframe: Keyframe) -> Node:
-        """Return the odometry factor from the previous keyframe."""
+        """Return the odometry factor from the previous keyframe to ``keyframe``."""
         step = keyframe.from_previous
         assert step is not None
         if self._maps or (MOTION in self._graph.keys and not keyframe.is_elsewhere):
@@ -323,7 +325,8 @@ class Incremental:
         return Node((previous, keyframe.key), native=native)
 
     def _new_solver(self, *, failed: bool = False) -> FullHistory | Window:
-        """Return an empty solver. ``failed``: True if the previous solver failed."""
+        """Return a new solver without factors. ``failed``: True if the previous solver failed. A slower factorisation
+        is then used."""
         parameters = gtsam.ISAM2Params()
         # Cholesky fails in long dead reckoning, but is twice as fast as QR if there are points
         parameters.setFactorization("CHOLESKY" if self._maps and not failed else "QR")

@@ -178,9 +178,9 @@ class Builder:
     def _observe(
         self, sensor: Sensor, m: Measurement, view: _KeyframeView, odometry: ChainState, addition: Addition | None
     ) -> bool:
-        """Convert a measurement of ``sensor`` to observations, and add these to ``addition``, or collect them if
-        ``addition`` is None. ``odometry``: the integrated odometry at its time. On the newest keyframe, each
-        observation also corrects the pose in ``view``. Returns True if any observation was accepted."""
+        """Convert the measurement ``m`` to observations, and add these to ``addition``, or collect them if it is None.
+        ``odometry``: the integrated odometry at its time. On the newest keyframe, each observation also corrects the
+        pose in ``view``. Returns True if any observation was accepted."""
         applied = False
         for observation in sensor.observe(m, view):
             if isinstance(observation, Link):
@@ -252,8 +252,8 @@ class Builder:
         return guess
 
     def _add_link(self, link: Link, sensor: Sensor, keyframe: Keyframe, addition: Addition) -> None:
-        """Add a link of ``sensor`` (such as a loop closure) between a keyframe and an earlier one to ``addition``. If
-        the earlier keyframe has left the solver, the link is only part of the final problem."""
+        """Add a factor between two poses (such as a loop closure) to ``addition``. ``link``: the factor and the time of
+        the earlier pose. If that pose is no longer in the solver, only the final optimisation uses the factor."""
         earlier = self._graph.keyframe_before(link.earlier)
         node = Node((keyframe.key, earlier.key), link.factor, link.rows, sensor=sensor.name)
         keyframe.nodes.append(node)
@@ -261,8 +261,8 @@ class Builder:
             addition.nodes.append(node)
 
     def _add_block(self, new: NewVariable, sensor: Sensor, view: _KeyframeView, addition: Addition) -> None:
-        """Add the landmark ``new``, observed at ``view``, and factors of its earlier observations by ``sensor`` to
-        ``addition``. If most of the observing poses have left the graph, the landmark gets a prior instead."""
+        """Add the landmark ``new``, and factors of its earlier observations by ``sensor``, to ``addition``. If most of
+        the observing poses have left the graph, the landmark gets a prior instead. ``view``: the observing keyframe."""
         graph = self._graph
         key = graph.new_block(new, view.covariance)
         addition.values[key] = new.mean

@@ -214,7 +214,7 @@ class Chained:
         return Covariances(dict(zip(self._poses, of_poses, strict=True)) | shared, 0.0)
 
     def _stacked(self, values: Values) -> list[Stack]:
-        """Return all factors in stacks. The factors of a stack are linearised together."""
+        """Return all factors, grouped so that the factors of a group can be linearised together."""
         place = {key: i for i, key in enumerate(self._poses)}
         kinds: defaultdict[Hashable, list[Placed]] = defaultdict(list)
         for factor, keys in self._factors:
@@ -247,8 +247,9 @@ def _is_stackable(kind: type[Factor]) -> bool:
 
 
 class _Others:
-    """A stack of factors of different kinds, each linearised separately. ``placed``: factors with the keys of their
-    variables. ``place``: the number of each pose by key. ``columns``: the parameters of each vector by key."""
+    """A group of factors of different classes, each linearised separately. ``placed``: pairs of a factor and the keys
+    of its variables. ``place``: the index of each pose by key. ``columns``: the indices of each vector's parameters by
+    key."""
 
     def __init__(self, placed: Sequence[Placed], place: dict[int, int], columns: dict[int, slice]) -> None:
         self._placed, self._place, self._columns = placed, place, columns
@@ -336,16 +337,16 @@ class Problem:
         return math.inf if math.isnan(cost) else cost
 
     def linearize(self, values: Values) -> gtsam.GaussianFactorGraph:
-        """Return all factors, linearised at ``values`` with their robust weights."""
+        """Return all factors as a linear graph, linearised at ``values`` with their robust weights."""
         graph = gtsam.GaussianFactorGraph()
         for factor in jacobian_factors(self._factors, values):
             graph.add(factor)
         return graph
 
     def covariances(self, values: Values, keys: Iterable[int]) -> Covariances:
-        """Return the marginal covariances of the variables ``keys``, and possibly of further variables, at the solution
-        ``values``. A covariance of a pose is in the body frame. Raises IndeterminateError if the graph does not
-        determine a variable."""
+        """Return the marginal covariances of the variables ``keys`` at the solution ``values``. The result may contain
+        further variables. The covariance of a pose is in the body frame. Raises IndeterminateError if a variable is not
+        determined."""
         marginals = None if self._chain is None else self._chain.covariances(values)
         if marginals is not None:
             return marginals

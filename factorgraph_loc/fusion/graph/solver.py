@@ -50,7 +50,7 @@ FOREVER = 1e300  # s; with this lag only variables with the time minus infinity 
 
 
 class FullHistory:
-    """An incremental solver that keeps its whole graph. After a method raises an error of GTSAM, discard the solver.
+    """An incremental solver that keeps all poses. After a method raises an error of GTSAM, discard the solver.
 
     ``threshold``: the change of a variable, in m, rad or the units of constants, after which it is linearised again.
     ``on_failure``: is called with the reason if a factor cannot be linearised. The factor is then left out.
@@ -320,7 +320,7 @@ class LinearFactors:
 
     @property
     def slots(self) -> frozenset[int]:
-        """The indices (slots) of these factors in the graph of the solver."""
+        """The indices that these factors have in the graph of the solver."""
         return frozenset(self._slots)
 
     def _moved(self, solver: gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother) -> list[_Linear]:
@@ -356,7 +356,7 @@ class LinearFactors:
 
 @dataclass(slots=True, eq=False)
 class _Linear:
-    """The factor of a measurement, and its slot, the index in the solver's factor graph."""
+    """The factor of a measurement (``node``). ``slot``: its index in the solver's factor graph."""
 
     node: Node
     slot: int = -1
