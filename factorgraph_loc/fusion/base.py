@@ -42,7 +42,7 @@ class Estimator(Protocol):
         """
 
     def process(self, measurement: Measurement) -> None:
-        """Process one measurement. A measurement that is late by more than the setting ``max_delay`` is counted and ignored."""
+        """Process one measurement. If it is late by more than the setting ``max_delay``, it is counted and ignored."""
 
     def estimate(self, t: float | None = None) -> PoseEstimate:
         """Return the pose at the time of the newest measurement, estimated from all measurements so far. If ``t`` [s]
@@ -76,7 +76,7 @@ class ForgettingEstimator(Protocol):
     memory."""
 
     def forget(self, until: float) -> None:
-        """Delete the trajectory before the time ``until`` [s], except for the part that late measurements can still change."""
+        """Delete the trajectory before the time ``until`` [s], except for what late measurements can still change."""
 
 
 @runtime_checkable

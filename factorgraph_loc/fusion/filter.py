@@ -134,8 +134,7 @@ class Filter(Timeline):
         return Learnt()
 
     def forget(self, until: float) -> None:
-        """Delete the trajectory before the time ``until`` [s], except for the part that late measurements can still
-        change."""
+        """Delete the trajectory before the time ``until`` [s], except for what late measurements can still change."""
         self._ahead = None
         t = min(until, self._t - self._max_delay)
         records = max(0, bisect.bisect_left(self._records, t, key=lambda record: record.t) - 1)

@@ -184,8 +184,8 @@ class Population:
         return kld.jittered(self._cloud.poses, rows, rng)
 
     def denies(self, place: PosePrior) -> bool:
-        """Return True if almost no particles are near the pose ``place``. Returns False if its time is not that of the
-        last observation."""
+        """Return True if almost no particles are near the pose ``place``. Returns False if there are too few
+        observations, or if the time of ``place`` is not that of the last observation."""
         if self._informative < CLEAR_OBSERVATIONS or self.newest is None or place.t != self.newest.t:
             return False
         assert self._cloud is not None

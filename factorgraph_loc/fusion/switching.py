@@ -142,7 +142,7 @@ class Switching:
         return at_ticks(ticks, np.array(times), poses, covariances)
 
     def forget(self, until: float) -> None:
-        """Delete the trajectory before the time ``until`` [s], except for the part that late measurements can still change."""
+        """Delete the trajectory before the time ``until`` [s], except for what late measurements can still change."""
         for part in (self._tags, self._vision):
             part.forget(until)
         self._ticks = [t for t in self._ticks if t >= until]

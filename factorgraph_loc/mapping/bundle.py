@@ -144,7 +144,8 @@ def robust_noise(model: CameraModel) -> Any:
 
 
 def _unknown_constants(model: CameraModel, *, lens: bool) -> Array:
-    """Return the prior covariance (9, 9) of fx, fy, skew, cx, cy, k1, k2, p1, p2. Without ``lens`` only fx and fy are unknown."""
+    """Return the prior covariance (9, 9) of fx, fy, skew, cx, cy, k1, k2, p1, p2. ``lens``: False if only fx and fy are
+    unknown."""
     covariance = FIXED**2 * np.eye(9)
     focal = np.array((model.fx, model.fy))
     covariance[:2, :2] += FOCAL_SIGMA**2 * np.outer(focal, focal) + ASPECT_SIGMA**2 * np.diag(focal**2)

@@ -84,7 +84,7 @@ def _focused(model: PhaseModel, reads: PhaseReads, height: float, prior: LearntP
 
 
 def _lattice(covariance: Array) -> Array:
-    """Return a lattice of displacements (G, 2) [m] within ``REACH`` standard deviations of zero. The first is zero itself."""
+    """Return a lattice of displacements (G, 2) [m] within ``REACH`` standard deviations of zero. The first is zero."""
     extent = np.minimum(REACH * np.sqrt(np.diag(covariance)), FARTHEST)
     axes = [np.arange(-e, e + STEP, STEP) for e in extent]
     cells = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)

@@ -93,7 +93,7 @@ class TagPosterior:
 
     @property
     def is_explained(self) -> bool:
-        """True if the best position explains the reads significantly better than randomly false reads do."""
+        """True if the best position explains the reads significantly better than accidental false reads do."""
         return bool(self.modes) and self.gain > GAIN
 
     @property

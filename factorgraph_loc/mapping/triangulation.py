@@ -31,7 +31,8 @@ RATIO = 0.85
 
 @dataclass(frozen=True, eq=False)
 class Cameras:
-    """Poses of cameras in the world: ``positions`` (F, 3) [m], ``rotations`` (F, 3, 3), axes z forward, x right, y down."""
+    """Poses of F cameras. ``positions`` (F, 3) [m] in the world. ``rotations`` (F, 3, 3): from the camera frame (x
+    right, y down, z forward) to the world."""
 
     positions: Array
     rotations: Array
@@ -263,6 +264,6 @@ def chained(frames: Sequence[CameraFrame], matches: Sequence[tuple[int, int, Int
 
 
 def angles_between(first: Array, second: Array) -> Array:
-    """Return the angles (F,) [rad] between the rotations ``first`` and ``second``, each (F, 3, 3) or a single one (3, 3)."""
+    """Return the angles (F,) [rad] between two sets of rotations. Each is (F, 3, 3), or a single rotation (3, 3)."""
     trace = np.einsum("nij,nij->n", *np.broadcast_arrays(first, second))
     return np.asarray(np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0)))

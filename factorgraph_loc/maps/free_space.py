@@ -40,7 +40,8 @@ def _segments(world: Walled) -> Array:
 
 @dataclass(frozen=True)
 class FreeSpace:
-    """The free space of a map: the largest connected set of K free cells in a grid of NX times NY cells of size :data:`CELL`.
+    """The free space of a map: the largest connected set of K free cells in a grid (NX, NY) of cells of size
+    :data:`CELL`.
 
     ``centres`` (K, 2): centres of the free cells [m]. ``graph`` (K, K): sparse matrix of the distances [m] between
     neighbouring free cells. ``index`` (NX, NY): the row of each free cell in ``centres``, -1 for other cells.
@@ -151,7 +152,7 @@ def straightened(space: FreeSpace, points: Array) -> Array:
 
 
 def dense(corners: Array, spacing: float = SPACING) -> Array:
-    """Return points (M, 2) about every ``spacing`` [m] along the path through ``corners`` (N, 2), without the first corner."""
+    """Return points (M, 2) about every ``spacing`` [m] along the path ``corners`` (N, 2), without the first corner."""
     along = np.concatenate((np.zeros(1), np.cumsum(np.hypot(*np.diff(corners, axis=0).T))))
     s = np.linspace(0.0, along[-1], max(2, round(along[-1] / spacing) + 1))[1:]
     return np.column_stack((np.interp(s, along, corners[:, 0]), np.interp(s, along, corners[:, 1])))

@@ -62,7 +62,7 @@ class Marker(FileModel):
     sigma: Annotated[float, Field(ge=0.0, le=10.0), InUnit("m")] = 0.0
 
     def corners(self) -> Array:
-        """Return the corners (4, 3) [m] in the world: upper left, upper right, lower right, lower left, seen from the front."""
+        """Return the corners (4, 3) [m] in the world: upper left, upper right, lower right, lower left for a viewer."""
         turn = scipy.spatial.transform.Rotation.from_euler("ZYX", (self.facing, -self.pitch, self.roll))
         return np.asarray(turn.apply(self.size * CORNERS) + np.array((self.x, self.y, self.z)))
 

@@ -80,7 +80,7 @@ def _occupied(path: Path, stated: MapFile) -> NDArray[np.bool_]:
 
 
 def _are_occupied(values: NDArray[np.uint8], stated: MapFile) -> NDArray[np.bool_]:
-    """Return a mask (R, C) of the occupied cells. ``values`` (R, C, 3 or 4): red, green, blue and opacity of each cell."""
+    """Return a mask (R, C) of the occupied cells. ``values`` (R, C, 3 or 4): red, green, blue, opacity of each cell."""
     grey = values[:, :, :3].mean(axis=2)
     if stated.mode == "raw":  # occupancy in percent, 255 where unknown
         return np.asarray((grey <= 100.0) & (grey >= 100.0 * stated.occupied_thresh))

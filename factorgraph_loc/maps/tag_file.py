@@ -25,7 +25,7 @@ UNIT = 0.01  # tolerance of the length of a quaternion
 
 
 class Place(FileModel):
-    """The pose of a bundle or of a standalone tag in the map, with the keys of a :class:`~factorgraph_loc.maps.markers.Marker`."""
+    """The pose of a bundle or a single tag in the map, with keys like :class:`~factorgraph_loc.maps.markers.Marker`."""
 
     x: Coordinate = 0.0
     y: Coordinate = 0.0

@@ -61,7 +61,8 @@ class PoseEstimate:
 
 @dataclass(frozen=True)
 class Mode:
-    """One Gaussian mode of a belief: ``weight`` from 0 to 1, ``pose`` (3,) in the world frame, and its ``covariance`` (3, 3)."""
+    """One Gaussian mode of a belief. ``weight``: from 0 to 1. ``pose`` (3,), ``covariance`` (3, 3): in the world
+    frame."""
 
     weight: float
     pose: Array

@@ -128,14 +128,14 @@ class PosePath(Exchange):
         return bool(np.ptp(self.positions[:, 2]) <= _FLAT and np.all(np.abs(self.rotations[:, 2, :2]) <= _FLAT))
 
     def stamps(self) -> Integers:
-        """Return the times (N,) [ns]. Raises InputError if they are unknown, as in KITTI files, or if they do not increase."""
+        """Return the times (N,) [ns]. Raises InputError if they are unknown, as in KITTI files, or do not increase."""
         if self.t_ns is None:
             raise InputError(f"{self.name}: has poses without times, expected poses with times")
         require_times(self.name, self.t_ns)
         return self.t_ns
 
     def seconds(self) -> Array:
-        """Return the times (N,) in seconds since 1970, rounded to the nearest float. Raises InputError as :meth:`stamps` does."""
+        """Return the times (N,) in seconds since 1970, rounded to the nearest float. For errors see :meth:`stamps`."""
         return np.array([t / 10**9 for t in self.stamps().tolist()])
 
     def rows(self, which: Integers) -> PosePath:

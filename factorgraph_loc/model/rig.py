@@ -26,8 +26,8 @@ class Rig(FileModel):
     robot lacks it.
 
     If the robot has several sensors of a kind, the attribute is a dict of settings by name. The full name of such a
-    sensor is ``bearing_range.front``, for example. ``sensors``: used by default. The name of a kind stands for all of
-    them.
+    sensor is ``bearing_range.front``, for example. ``sensors``: names of the default sensors of a run. The name of a
+    kind means all sensors of that kind.
     """
 
     name: str = "rig"

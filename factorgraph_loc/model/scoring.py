@@ -71,7 +71,7 @@ def check_prior(prior: str | None) -> None:
 
 
 def parse_position(prior: str) -> list[float]:
-    """Return the numbers of a start ``X,Y`` or ``X,Y,HEADING``, in m and rad. Raises InputError if the text is neither."""
+    """Return the numbers of a start ``X,Y`` or ``X,Y,HEADING`` [m, rad]. Raises InputError if the text is neither."""
     from factorgraph_loc.files.models import FARTHEST  # noqa: PLC0415 - imports pydantic
 
     try:

@@ -85,7 +85,7 @@ def several() -> frozenset[str]:
 
 
 def kind_of(name: str) -> str:
-    """Return the kind of a sensor, the part of its name before the dot: ``bearing_range`` for ``bearing_range.front``."""
+    """Return the kind of a sensor, its name before the dot: ``bearing_range`` for ``bearing_range.front``."""
     return name.partition(".")[0]
 
 

@@ -47,9 +47,9 @@ Covariance = Annotated[tuple[Variance, Variance, Variance], AfterValidator(_posi
 
 
 def spread_of(sigma: float, covariance: tuple[float, float, float] | None) -> Array:
-    """Return the covariance (2, 2) [m^2] of a position, from ``covariance`` (xx, xy, yy) or the standard deviation ``sigma`` [m].
+    """Return the covariance (2, 2) [m^2] of a position. ``covariance``: its elements (xx, xy, yy) [m^2], or None.
 
-    ``sigma`` is used if ``covariance`` is None.
+    ``sigma`` [m]: the standard deviation of each coordinate, used if ``covariance`` is None.
     """
     if covariance is None:
         return sigma**2 * np.eye(2)

@@ -53,7 +53,8 @@ class Trajectory(Exchange):
         return cls(checks.seconds(path.stamps(), t0_ns), path.on_floor([]), has_heading=path.has_rotations)
 
     def path(self, name: str, t0_ns: int = 0) -> PosePath:
-        """Return the poses as a :class:`PosePath` with that ``name``, at height 0. ``t0_ns``: absolute time of t = 0 [ns]."""
+        """Return a :class:`PosePath` of the poses at height 0, called ``name``. ``t0_ns``: absolute time of t = 0
+        [ns]."""
         headings = self.poses[:, 2] if self.has_heading else np.zeros(len(self))
         positions = np.column_stack((self.poses[:, :2], np.zeros(len(self))))
         return PosePath(name, positions, upright(headings), checks.absolute(self.t, t0_ns), self.has_heading)
@@ -98,7 +99,7 @@ class Trajectory(Exchange):
 
     @classmethod
     def from_polars(cls, table: pl.DataFrame) -> Self:
-        """Return a trajectory from a table with the columns t [s], x, y [m] and heading [rad]. Other columns are ignored.
+        """Return a trajectory from a table with the columns t [s], x, y [m] and heading [rad]. Others are ignored.
 
         Optional columns of covariances are cov_xx, cov_xy, cov_xh, cov_yy, cov_yh and cov_hh. Raises InputError if a
         column is missing, or if it has values that are not numbers.
@@ -111,7 +112,7 @@ class Trajectory(Exchange):
         return replace(trajectory, covariances=symmetric(list(numbers(table, COVARIANCES).T)))
 
     def to_polars(self) -> pl.DataFrame:
-        """Return the poses as a table with the columns of :meth:`from_polars`. It has covariances if the trajectory has them."""
+        """Return a table with the columns of :meth:`from_polars`, with covariances if the trajectory has them."""
         table, known = super().to_polars(), self.covariances
         return (
             table if known is None else table.with_columns(**{k: known[:, i, j] for k, (i, j) in COVARIANCES.items()})

@@ -39,7 +39,7 @@ def filled(height: int, width: int, colour: Colour) -> Canvas:
 
 
 def clouds(rng: np.random.Generator, height: int, width: int, cell: float) -> NDArray[np.float32]:
-    """Return smooth noise (height, width) with a standard deviation of about 1 and a correlation length of ``cell`` texels."""
+    """Return smooth noise (height, width) of about unit variance. ``cell``: the correlation length in texels."""
     coarse = rng.standard_normal((2 + int(height / cell), 2 + int(width / cell))).astype(np.float32)
     return np.asarray(cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC), dtype=np.float32)
 
@@ -53,7 +53,7 @@ def shaded(canvas: Canvas, factor: NDArray[np.float32]) -> Canvas:
 
 
 def paste(canvas: Canvas, picture: Canvas, x: int, y: int) -> None:
-    """Paste a picture into ``canvas`` with its upper left corner at texel (x, y). Parts outside of the canvas are clipped."""
+    """Paste a picture into ``canvas`` with its upper left corner at texel (x, y). Parts outside are clipped."""
     height, width = canvas.shape[:2]
     x0, y0 = max(x, 0), max(y, 0)
     x1, y1 = min(x + picture.shape[1], width), min(y + picture.shape[0], height)
@@ -62,7 +62,8 @@ def paste(canvas: Canvas, picture: Canvas, x: int, y: int) -> None:
 
 
 def write(canvas: Canvas, rng: np.random.Generator, box: tuple[int, int, int, int], size: int, colour: Colour) -> None:
-    """Draw lines of random letters on ``canvas``, in ``box`` (x1, y1, x2, y2). A letter has 5 x 3 dots of ``size`` texels."""
+    """Draw lines of random letters in ``box`` (x1, y1, x2, y2) of a picture. A letter has 5 x 3 dots of ``size``
+    texels."""
     x1, y1, x2, y2 = box
     letters, lines = (x2 - x1) // (4 * size), (y2 - y1) // (8 * size)
     for line in range(lines):

@@ -108,8 +108,9 @@ def surroundings(faces: Array, bottoms: Array, tops: Array, origin: Array, size:
 def cast(table: Array, starts: Ints, items: Ints, place: Place, dx: float, dy: float, dz: float) -> tuple[int, float]:
     """Return the index of the face that the ray along (dx, dy, dz) hits first, and the distance of the hit point.
 
-    The index is a row of the table, or :data:`GROUND`, :data:`CEILING` or :data:`NOTHING`. The distance is in units of the length
-    of the vector (dx, dy, dz). ``table``, ``starts``, ``items``: of :class:`Surroundings`. ``place``: the camera and the building.
+    The index is a row of the table, or :data:`GROUND`, :data:`CEILING` or :data:`NOTHING`. The unit of the distance is
+    the length of (dx, dy, dz). ``table``, ``starts``, ``items``: of :class:`Surroundings`. ``place``: the camera and
+    the building.
     """
     best, row = np.inf, NOTHING
     x0, y0, z0, top, per_width, per_depth = place

@@ -139,7 +139,7 @@ def _paste_with_shadow(canvas: Canvas, picture: Canvas, x: int, y: int) -> None:
 
 
 def _draw_low_furniture(canvas: Canvas, rng: np.random.Generator, texel: float) -> None:
-    """Draw sideboards and low shelves at the foot of a wall with the texture ``canvas``. ``texel`` [m]: the size of a texel."""
+    """Draw sideboards and low shelves at the foot of the wall ``canvas``. ``texel`` [m]: the size of a texel."""
     height, width = canvas.shape[:2]
     x = rng.uniform(0.0, 1.0)
     while x < width * texel - 0.4:
@@ -161,7 +161,7 @@ def _draw_fixtures(canvas: Canvas, rng: np.random.Generator, texel: float) -> No
 
 
 def _lighted(canvas: Canvas, rng: np.random.Generator, texel: float) -> Canvas:
-    """Return the texture of a wall in the light of the ceiling: with bright spots, and darker in the corners and near the floor."""
+    """Return the texture of a wall in the light of the ceiling: bright spots, dark corners, darker near the floor."""
     height, width = canvas.shape[:2]
     factor = 1.0 + 0.05 * pictures.clouds(rng, height, width, 1.5 / texel)
     factor *= np.linspace(1.05, 0.85, height, dtype=np.float32)[:, None]
@@ -171,7 +171,7 @@ def _lighted(canvas: Canvas, rng: np.random.Generator, texel: float) -> Canvas:
 
 
 def _grain(rng: np.random.Generator, height: int, width: int) -> NDArray[np.float32]:
-    """Return fine noise (H, W) of unit variance. It repeats every 512 texels, which is not visible at small amplitudes."""
+    """Return fine noise (height, width) of unit variance. It repeats every 512 texels, which is hardly visible."""
     tile = rng.standard_normal((512, 512)).astype(np.float32)
     return np.asarray(np.tile(tile, (height // 512 + 1, width // 512 + 1))[:height, :width])
 

@@ -114,9 +114,10 @@ def _office(width: float, depth: float, outline: tuple[Segment, ...], rng: np.ra
 
 
 def _furniture(span: tuple[float, float], inner: float, outer: float, rng: np.random.Generator) -> list[Segment]:
-    """Return a cupboard for each outer corner of a room, as boxes. The list is empty if the robot could not drive past them.
+    """Return a cupboard for each outer corner of a room, as boxes, or nothing if the robot could not drive past.
 
-    ``span``: the x range of the room. ``inner``, ``outer``: the y coordinates of its walls at the corridor and at the outline.
+    ``span``: the x range of the room. ``inner``, ``outer``: the y coordinates of its walls at the corridor and at the
+    outline.
     """
     left, right = span
     deep, wide = abs(inner - outer), right - left
@@ -255,8 +256,9 @@ def _points(plan: Plan, walls: Array, boxes: Array, count: int, rng: np.random.G
 
 
 def _even(settings: WorldSettings, count: int) -> Array:
-    """Return ``count`` places (count, 3) at equal distances along the two walls of the outline that are parallel to x. For an even
-    count they are symmetric to reflections and half-turns. The columns are x, y and the direction [rad] away from the wall."""
+    """Return ``count`` places (count, 3) at equal distances along the two outer walls that are parallel to x. The
+    columns are x, y and the direction [rad] away from the wall. An even number of places is symmetric to reflections
+    and half-turns."""
     below, above = (count + 1) // 2, count // 2
     width, depth = settings.width, settings.depth
     rows = (((0.0, 0.0, width, 0.0), below), ((width, depth, 0.0, depth), above))

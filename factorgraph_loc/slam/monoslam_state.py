@@ -298,7 +298,7 @@ class Innovation:
 
 
 def squared(residual: Array, covariance: Array) -> Array:
-    """Return the squared Mahalanobis distances (K,) of ``residual`` (K, 2) for the covariances ``covariance`` (K, 2, 2)."""
+    """Return the squared Mahalanobis distances (K,) of ``residual`` (K, 2), for a ``covariance`` (K, 2, 2) of each."""
     a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     x, y = residual[:, 0], residual[:, 1]
     return np.asarray((c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b))

@@ -75,7 +75,7 @@ class _NewImage:
 
 
 class UnknownPoints(Mapper):
-    """Adds the points of images to a graph as variables. ``estimated``: the camera constants that the graph estimates."""
+    """Adds the points of images to a graph as variables. ``estimated``: the estimated constants of the camera."""
 
     def __init__(self, model: CameraModel, diagnostics: Diagnostics, estimated: Estimated = NOTHING) -> None:
         self.model, self.diagnostics, self.estimated = model, diagnostics, estimated

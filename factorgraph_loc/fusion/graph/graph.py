@@ -166,11 +166,11 @@ class Mapper:
 
 
 class Graph:
-    """A factor graph of a run: ``keyframes`` by number, and all other variables by key in ``values`` and ``covariances``.
+    """A factor graph of a run. ``keyframes``: by number. ``values``, ``covariances``: of all other variables, by key.
 
     ``newest``: the last keyframe, whose present estimate is ``pose`` (3,) with body-frame ``covariance`` (3, 3).
     ``keys``: the keys of constants and landmarks by name. ``departed``: estimates and covariances of points that have
-    left the graph. ``t`` [s]: the newest time. The backend sets two functions: ``current(key)`` returns the present
+    left the graph. ``t`` [s]: the newest time. The solver sets two functions: ``current(key)`` returns the present
     estimate of a variable, and ``is_open(number)`` is True if a keyframe may still get factors.
     """
 
@@ -310,7 +310,7 @@ class Graph:
         return key
 
     def node(self, keyframe: Keyframe, term: Term, sensor: str) -> Node:
-        """Return a factor of an observation (``term``) at a keyframe as a node. ``sensor``: the name of the sensor."""
+        """Return a factor (``term``) of an observation at a keyframe as a node. ``sensor``: the sensor's name."""
         keys = (keyframe.key, *map(self.keys.__getitem__, term.blocks))
         return Node(keys, term.factor, term.rows, sensor=sensor)
 

@@ -157,7 +157,7 @@ class Incremental:
         return self._is_whole or self.is_open(keyframe)
 
     def _update(self, addition: Addition) -> None:
-        """Update the solver with the factors of ``addition`` and the waiting factors. After a failure a new solver is built."""
+        """Update the solver with the waiting factors and those of ``addition``. If this fails, build a new solver."""
         newest, nodes, values = self._graph.newest, addition.nodes, addition.values
         if self._waiting.nodes or self._waiting.values:
             nodes, values = self._waiting.nodes + nodes, self._waiting.values | values

@@ -212,7 +212,7 @@ class Builder:
         return applied
 
     def _add_keyframe(self, odometry: ChainState, m: Measurement | None) -> None:
-        """Add a keyframe at the time of ``odometry``. ``m``: a measurement at this time to add on the keyframe, or None."""
+        """Add a keyframe at the time of ``odometry``. ``m``: a measurement at this time to process on it, or None."""
         graph, newest, t = self._graph, self._graph.newest, odometry.t
         keyframe = Keyframe(newest.index + 1, t, *graph.motion.travelled(newest.odometry, t))
         pose, covariance, _ = graph.moved(t)

@@ -303,7 +303,8 @@ class LinearFactors:
             self._slots.add(linear.slot)
 
     def forget(self, key: int) -> None:
-        """Delete the stored data of the variable ``key`` and of all factors on it. Call this after it has left the solver."""
+        """Delete the data of the variable ``key`` and of its factors. Call this after it was removed from the
+        solver."""
         del self.at[key]
         self._held.pop(key, None)
         for linear in self._on.pop(key, {}).values():
