@@ -155,7 +155,8 @@ def map_points(
     total, (chosen, old) = tracks.count, tracks.kept(good[tracks.track])
     if (settings.focal or settings.lens) and not model.is_brown:
         raise InputError(
-            "focal and lens need a camera with distortion_model plumb_bob and four numbers: remove both settings"
+            "focal and lens need a camera with distortion_model plumb_bob and the coefficients k1, k2, p1, p2: "
+            "remove both settings"
         )
     try:
         adjusted = bundle.adjust(

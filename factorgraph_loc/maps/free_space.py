@@ -19,8 +19,8 @@ SPACING = 0.05  # m between points of a path
 
 
 class Walled(Protocol):
-    """An object with walls, such as a map. ``walls``: ends (x1, y1, x2, y2) [m] of each. ``name``: its name in
-    errors."""
+    """An object with walls, such as a map. ``walls``: a segment (x1, y1, x2, y2) [m] for each wall. ``name``: the name
+    of the object in error messages."""
 
     @property
     def name(self) -> str: ...
@@ -82,9 +82,10 @@ class FreeSpace:
 
 
 def free_space(world: Walled, clearance: float) -> FreeSpace:
-    """Return the largest connected set of cells whose centres are more than ``clearance`` [m] from all walls.
+    """Return the largest connected set of grid cells whose centres are more than ``clearance`` [m] from all walls of
+    ``world``.
 
-    Raises InputError if the map has no walls, or if no cell has that clearance.
+    Raises InputError if the map has no walls, or if no cell is that far from all walls.
     """
     walls = np.array(world.walls).reshape(-1, 2, 2)
     if not len(walls):
@@ -127,9 +128,10 @@ def shortest_path(space: FreeSpace, start: int, end: int) -> Array:
 
 
 def chain(predecessors: NDArray[np.int32], start: int) -> list[int]:
-    """Return the indices of the cells from ``start`` to the root of a tree of shortest paths.
+    """Return the indices of the cells on the path from ``start`` to the root of a tree of shortest paths, both
+    included.
 
-    ``predecessors`` (K,): the next cell towards the root, from each cell. It is negative at the root.
+    ``predecessors`` (K,): for each of K cells the index of the next cell towards the root. It is negative at the root.
     """
     cells = [start]
     while predecessors[cells[-1]] >= 0:
@@ -159,8 +161,8 @@ def dense(corners: Array, spacing: float = SPACING) -> Array:
 
 
 def _graph(index: NDArray[np.int64]) -> sparse.csr_matrix:
-    """Return the distances (K, K) [m] between neighbouring free cells, as a sparse matrix. ``index``: see
-    :class:`FreeSpace`.
+    """Return the distances (K, K) [m] between neighbouring cells of K free cells, as a sparse matrix. ``index``
+    (NX, NY): the index of each free cell, -1 for other cells of the grid.
 
     A cell has up to eight neighbours. A diagonal neighbour is included only if both cells next to the diagonal are
     free.

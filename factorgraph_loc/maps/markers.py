@@ -79,8 +79,8 @@ def corner_names(marker: str) -> list[str]:
 
 
 def marker_of(point: str) -> str | None:
-    """Return the name of the marker with a corner called ``point``, a point of the map. Returns None if there is
-    none."""
+    """Return the name of the marker that has ``point`` as a corner. ``point``: the name of a point of the map. Returns
+    None if the point is no corner of a marker."""
     marker, _, corner = point.rpartition("/")
     is_corner = corner in CORNER_NUMBERS and marker.rpartition("-")[0] in get_args(MarkerFamily)
     return marker if is_corner else None

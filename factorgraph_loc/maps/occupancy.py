@@ -68,7 +68,8 @@ def read_walls(path: Path) -> tuple[Wall, ...]:
 
 
 def _occupied(path: Path, stated: MapFile) -> NDArray[np.bool_]:
-    """Return a mask (rows, columns) of the occupied cells of the image ``path``. Transparent cells are not occupied."""
+    """Return a mask (R, C) of the occupied cells of the map image ``path``, by rows and columns of the image.
+    ``stated``: the content of the map's YAML file. Transparent cells are not occupied."""
     with opened(path, IMAGE) as file, pillow_image(file, path) as image:
         # the grey level of a colour is the mean of its channels, as in map_server
         mode = "RGBA" if "A" in image.getbands() or "transparency" in image.info else "RGB"
@@ -80,7 +81,8 @@ def _occupied(path: Path, stated: MapFile) -> NDArray[np.bool_]:
 
 
 def _are_occupied(values: NDArray[np.uint8], stated: MapFile) -> NDArray[np.bool_]:
-    """Return a mask (R, C) of the occupied cells. ``values`` (R, C, 3 or 4): red, green, blue, opacity of each cell."""
+    """Return a mask (R, C) of the occupied cells. ``values`` (R, C, 3 or 4): red, green, blue, opacity of each cell.
+    ``stated``: the content of the map's YAML file, which has the thresholds."""
     grey = values[:, :, :3].mean(axis=2)
     if stated.mode == "raw":  # occupancy in percent, 255 where unknown
         return np.asarray((grey <= 100.0) & (grey >= 100.0 * stated.occupied_thresh))
@@ -90,7 +92,8 @@ def _are_occupied(values: NDArray[np.uint8], stated: MapFile) -> NDArray[np.bool
 
 
 def _outlines(occupied: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return the outlines of ``occupied`` (rows, columns) as segments (W, 4): column and row of both ends."""
+    """Return the outlines of the cells of the mask ``occupied`` (R, C) as segments (W, 4): column and row of both
+    ends."""
     import cv2  # noqa: PLC0415 - worlds without such a map need no OpenCV
 
     contours, _ = cv2.findContours(occupied.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)

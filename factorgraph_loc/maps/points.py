@@ -94,7 +94,7 @@ class PointMap:
         )
 
     def chosen(self, which: Integers) -> PointMap:
-        """Return a map of only the points with the indices ``which``, and their views."""
+        """Return a map with only the points with the indices ``which``, and their views."""
         place = np.full(len(self), -1, dtype=np.int64)
         place[which] = np.arange(len(which))
         views = np.flatnonzero(place[self.owners] >= 0)
@@ -200,7 +200,8 @@ def read_points(path: Path) -> PointMap:
 
 
 def _numbers(table: pl.DataFrame, name: str, rows: NDArray[np.int64], path: Path) -> Array:
-    """Return the numbers (R,) of the column ``name`` in ``rows`` (R,). Raises InputError if one is out of bounds."""
+    """Return the values (R,) of the column ``name`` in the rows with the indices ``rows`` (R,). Raises InputError if a
+    value is out of bounds, or the column is missing. ``path``: the file in errors."""
     if name not in table.columns or not table[name].dtype.is_numeric():
         raise InputError(f"{path}: has no column {name} of numbers")
     values = np.asarray(table[name].cast(pl.Float64).to_numpy(), dtype=float)[rows]
@@ -213,7 +214,8 @@ def _check_covariances(
 ) -> None:
     """Raise InputError at the first of ``covariances`` (N, 3, 3) that is not positive semi-definite.
 
-    The error names the table's ``columns``, and one of N point ``names`` and of the ``rows`` (N,), counted from 0.
+    ``columns``: of the covariance in the table of the file ``path``. ``names``, ``rows`` (N,): the point and the row of
+    the table, counted from 0, of each covariance.
     """
     least, _, most = np.linalg.eigvalsh(covariances).T
     if len(bad := np.flatnonzero(least < -ROUNDING * np.abs(most))):
@@ -294,8 +296,9 @@ class CommonError:
     def at(self, poses: Array, looking: float = 0.0) -> Array:
         """Return the covariances (N, 3, 3) [m, rad] of the shared error at the ``poses`` (N, 3) of a robot.
 
-        For each pose, the camera position of the map that is nearest in distance and direction of view is selected. Its
-        covariance is then moved to the pose (:func:`carried`). ``looking``: camera direction in the robot frame [rad].
+        For each pose, the camera position of the map is selected that is nearest in distance and direction of view. Its
+        covariance is transformed to the pose by :func:`carried`. ``looking`` [rad]: the direction of the robot's camera
+        in the robot frame.
         """
         ahead = poses[:, 2] + looking
         cosine = np.column_stack((np.cos(ahead), np.sin(ahead))) @ self.directions.T
@@ -305,10 +308,11 @@ class CommonError:
 
 
 def carried(covariances: Array, arms: Array) -> Array:
-    """Return the covariances (N, 3, 3) of the poses (x, y, heading) [m, rad] of N points on rigid bodies.
+    """Return the covariances (N, 3, 3) of (x, y, heading) [m, rad] of N points. Each point is fixed to a rigid body, on
+    which another point has a known covariance.
 
-    ``covariances`` (N, 3, 3): of another point on each body. ``arms`` (N, 2): the vectors from that point to the point
-    [m]. All are in the world frame.
+    ``covariances`` (N, 3, 3): of the other point. ``arms`` (N, 2) [m]: the vector from the other point to the point.
+    All are in the world frame.
     """
     lever = np.repeat(np.eye(3)[None], len(arms), axis=0)
     lever[:, 0, 2], lever[:, 1, 2] = -arms[:, 1], arms[:, 0]
@@ -316,7 +320,8 @@ def carried(covariances: Array, arms: Array) -> Array:
 
 
 def without_common(points: PointMap) -> PointMap:
-    """Return the map with the shared error (:class:`CommonError`) subtracted from the covariances of its points."""
+    """Return the map with the covariance of the shared error (:class:`CommonError`) subtracted from that of each point.
+    A map without a shared error is returned unchanged."""
     if points.common is None:
         return points
     moved = carried(points.common, points.positions[points.owners, :2] - points.seen_from[:, :2])[:, :2, :2]

@@ -25,7 +25,8 @@ UNIT = 0.01  # tolerance of the length of a quaternion
 
 
 class Place(FileModel):
-    """The pose of a bundle or a single tag in the map, with keys like :class:`~factorgraph_loc.maps.markers.Marker`."""
+    """The pose of a bundle or a single tag in the map. ``x``, ``y``, ``z`` [m]: its position. ``facing``, ``pitch``,
+    ``roll`` [rad]: heading and upward tilt of the normal, and rotation about it."""
 
     x: Coordinate = 0.0
     y: Coordinate = 0.0
@@ -44,8 +45,8 @@ class TagFile(FileModel):
     """The section ``[markers]`` of a world file that refers to a file of apriltag_ros.
 
     ``file``: the path of that file. ``family``: the family of the tags. ``sigma`` [m]: standard deviation of each
-    coordinate of a tag's position. ``at``: the poses of bundles by name and of standalone tags by number. A bundle
-    without a pose has the frame of the map.
+    coordinate of a tag's position. ``at``: the poses {name of a bundle, or number of a single tag: pose}. The frame of
+    a bundle without a pose is the frame of the map.
     """
 
     file: str
@@ -123,8 +124,8 @@ def read_tag_file(content: dict[str, Any], source: object, folder: Path) -> dict
 
 
 def _marker(path: Path, tag: BundledTag, rotation: Array, position: Array) -> dict[str, float]:
-    """Return a ``tag`` as a dict with the keys and values of a world file. ``rotation`` (3, 3), ``position`` (3,): the
-    pose of its bundle in the world. ``path``: the name of the file in errors."""
+    """Return a ``tag`` as a marker: a dict with the keys and values of a world file. ``rotation`` (3, 3), ``position``
+    (3,): the pose of the tag's bundle in the world. ``path``: the name of the file in errors."""
     quaternion = np.array((tag.qx, tag.qy, tag.qz, tag.qw))
     if not abs(float(np.linalg.norm(quaternion)) - 1.0) <= UNIT:
         raise bad_field(path, f"tag {tag.id}: qx, qy, qz, qw", quaternion.tolist(), "a unit quaternion")

@@ -36,9 +36,9 @@ ONE_PLACE = 0.99  # weight of a mode above which the particles agree on one pose
 
 @dataclass(frozen=True)
 class ProximityReading:
-    """Free lengths around the robot from a proximity sensor, an observation that weights the particles of a filter.
-    ``lengths`` (D,) [m]: in D directions. ``found``, ``work``, ``things``: constants that every observation must
-    have."""
+    """A measurement of a proximity sensor, as an observation that weights the particles of a filter. ``lengths`` (D,)
+    [m]: the measured distances to the next wall in D directions. ``found``, ``work``, ``things``: see
+    :class:`~factorgraph_loc.sensors.base.Observation`; equal for all readings."""
 
     sensor: ProximitySensor
     lengths: Array
@@ -70,8 +70,8 @@ class ActiveMcl:
         raise NotImplementedError("ActiveMCL always starts at an unknown pose")
 
     def process(self, measurement: Measurement) -> None:
-        """Process one measurement. Measurements must come in the order of time. A tick moves the particles to its time,
-        and records the estimate."""
+        """Process one measurement. Measurements must be in the order of their times. A :class:`Tick`, a time at which
+        the run records the estimate, moves the particles to its time and stores the estimate."""
         if measurement.is_motion:
             self._motion.add(measurement)
             return
@@ -89,8 +89,10 @@ class ActiveMcl:
         self._search.advance(self._t)
 
     def estimate(self, t: float | None = None) -> PoseEstimate:
-        """Return the mode with the largest weight, ``localized`` if its weight is above :data:`ONE_PLACE`. ``t`` [s]:
-        the time of the estimate. None, or an earlier time, means the time of the last measurement."""
+        """Return the pose and covariance of the mode with the largest weight. The status is ``localized`` if this
+        weight is above :data:`ONE_PLACE`, otherwise ``ambiguous``. Without particles the pose is NaN and the status is
+        ``unlocalized``. ``t`` [s]: the time of the estimate. None, or an earlier time, means the time of the last
+        measurement."""
         at = self._t if t is None else max(t, self._t)
         modes = self._search.modes(at) if self._search.newest is not None else []
         if not modes:
@@ -99,8 +101,9 @@ class ActiveMcl:
         return PoseEstimate(at, modes[0].pose, modes[0].covariance, status)
 
     def belief(self, t: float | None = None) -> Belief:
-        """Return the modes and the particles at the time ``t`` [s], None for the time of the last measurement. If the
-        weight of one mode is above :data:`ONE_PLACE`, only its particles are returned."""
+        """Return the modes and the weighted particles at the time ``t`` [s]. None, or an earlier time, means the time
+        of the last measurement. If the weight of one mode is above :data:`ONE_PLACE`, only the particles of this mode
+        are returned. Without particles the belief is empty."""
         at = self._t if t is None else max(t, self._t)
         particles = self._search.particles(at) if self._search.newest is not None else None
         if particles is None:
@@ -116,7 +119,8 @@ class ActiveMcl:
         return Learnt()
 
     def trajectory(self) -> Trajectory:
-        """Return the estimates that were recorded at the ticks, each from measurements up to its time."""
+        """Return the recorded estimates: one for each :class:`Tick` that was processed, from the measurements up to its
+        time."""
         poses = np.array([r.pose for r in self._records]).reshape(-1, 3)
         covariances = np.array([r.covariance for r in self._records]).reshape(-1, 3, 3)
         return Trajectory(np.array([r.t for r in self._records]), poses, covariances)

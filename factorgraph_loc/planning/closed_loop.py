@@ -75,14 +75,14 @@ class PlanningStep:
 
 @dataclass(frozen=True)
 class ActiveRun:
-    """The result of a run of one policy with one estimator in one world, simulated from a ``preset`` with a ``seed``.
+    """The result of a run of one policy with one estimator in one simulated world.
 
-    ``localized``: True if the robot was localized correctly. The run ends then.
-    ``metres`` [m], ``seconds`` [s]: distance and time at the end of the run.
-    ``error_position`` [m], ``error_heading`` [rad]: the errors of the estimate at the end.
-    ``claimed_wrong``: True if the estimate ever had the status ``localized`` with an error above :data:`WRONG` times
-    the limit of the settings.
-    ``truth``: the true trajectory. ``steps``: the choices of paths.
+    ``seed``: the seed of the random numbers. ``preset``: the name of the simulation's settings. ``localized``: True if
+    the run ended because the robot was localized correctly. ``metres`` [m], ``seconds`` [s]: driven distance and time
+    at the end of the run. ``error_position`` [m], ``error_heading`` [rad]: the errors of the last estimate.
+    ``claimed_wrong``: True if an estimate with the status ``localized`` had an error above :data:`WRONG` times
+    ``position_limit`` or ``heading_limit`` of the settings. ``truth``: the true trajectory. ``steps``: the choices of
+    paths.
     """
 
     seed: int
@@ -108,11 +108,14 @@ class ActiveRun:
 def run_active(
     simulation: SimulationSettings, policy: str, estimator: str, seed: int, settings: ActiveSettings | None = None
 ) -> ActiveRun:
-    """Simulate a robot that drives from an unknown start until it is localized, or until a limit is reached.
+    """Return the result of a simulated drive from an unknown start, which ends when the robot is localized or reaches a
+    limit.
 
-    ``policy``, ``estimator``: names. Runs with the same ``seed`` have the same world, start and noise sequences. Raises
-    InputError for an unknown name, a start that is not free, or a sensor that is faster than the robot's control.
-    Raises RunFailedError if the estimator fails.
+    ``policy``, ``estimator``: names. ``simulation``: settings of the world and the sensors. ``settings``: of the active
+    run; None means the defaults. Runs with the same ``seed`` have the same world, start and noise sequences.
+
+    Raises InputError for an unknown name, a start that is not free, or a sensor that is faster than the robot's
+    control. Raises RunFailedError if the estimator fails.
     """
     loop = _ClosedLoop(simulation, policy, estimator, seed, settings or ActiveSettings())
     localized = loop.run()
@@ -136,7 +139,7 @@ def run_active(
 
 
 class _ClosedLoop:
-    """A simulated run. Repeatedly a policy chooses a path, the robot drives it, and measurements update the
+    """A simulated run. In each step a policy chooses a path, the robot drives it, and the measurements update the
     estimate."""
 
     def __init__(
@@ -315,8 +318,8 @@ def _start(plan: Plan, world: World, space: FreeSpace, settings: ActiveSettings,
 
 
 def _main_modes(belief: Belief) -> tuple[Mode, ...]:
-    """Return at most :data:`MODES` modes of a belief with a weight of at least :data:`LIKELY`. Neighbouring modes
-    become one, with the pose of the first mode and the sum of the weights."""
+    """Return at most :data:`MODES` modes of a belief, each with a weight of at least :data:`LIKELY`. Modes with
+    neighbouring poses are merged: the result has the pose of the first and the sum of the weights."""
     places: list[Mode] = []
     for mode in belief.modes:
         if not np.all(np.isfinite(mode.pose)):

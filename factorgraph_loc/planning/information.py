@@ -186,9 +186,9 @@ def expected_gain(
 
 
 def _entropies(poses: Array, index: Places, weights: Array32, dims: int, *, several: bool) -> Array:
-    """Return the entropies (J,) [nats] of particles. ``poses`` (S, M, 3): the particles at S stations. ``index`` (J,):
-    the station of each entropy. ``weights`` (J, M): the particles' weights for each entropy. ``dims``: the number of
-    leading coordinates that are considered. ``several``: True to use a histogram, False to use a Gaussian."""
+    """Return J entropies (J,) [nats] of M particles. ``poses`` (S, M, 3): the particles at S stations. ``index`` (J,):
+    the index of the station of each entropy. ``weights`` (J, M): the particles' weights for each entropy. ``dims``: the
+    number of leading coordinates that are considered. ``several``: True to use a histogram, False to use a Gaussian."""
     if several:
         out = np.empty(len(index))
         particle_kernels.cell_entropies(poses, index, weights, CELL, dims, out)
@@ -225,8 +225,8 @@ def _sigmas(path: Path, steps: Places, noise: OdometryModel) -> Array:
 def expected_covariance(mean: Array, covariance: Array, path: Path, sensors: Sensors) -> Array:
     """Return the expected covariance (3, 3) of x, y and heading in the world frame at the end of a path.
 
-    ``mean`` (3,), ``covariance`` (3, 3): the belief at the start of the path, also in the world frame. The sensors
-    measure at each pose of the path except the first.
+    ``mean`` (3,), ``covariance`` (3, 3): the belief at the start of the path, also in the world frame. ``sensors``: the
+    sensor models, which predict measurements at each pose of the path except the first.
     """
     body = se2.world_to_body(mean, covariance)
     poses = se2.compose(mean, path.poses)
@@ -248,10 +248,11 @@ def expected_covariance(mean: Array, covariance: Array, path: Path, sensors: Sen
 
 def fisher_gain(mean: Array, covariance: Array, paths: Sequence[Path], sensors: Sensors) -> Array:
     """Return the expected reduction of entropy (C,) [nats] of a Gaussian belief on each of C paths. It is negative if
-    the noise of the motion exceeds the gain.
+    the noise of the motion adds more entropy than the measurements remove.
 
-    ``mean`` (3,), ``covariance`` (3, 3): the belief, with the covariance of (x, y, heading) in the world. Standard
-    deviations below :data:`~factorgraph_loc.planning.information.FINEST` are not counted as a gain.
+    ``mean`` (3,), ``covariance`` (3, 3): the belief over (x, y, heading), in the world frame. ``sensors``: the sensor
+    models. Reducing a standard deviation that is below :data:`~factorgraph_loc.planning.information.FINEST` gains
+    almost nothing.
     """
     fine = np.diag(FINEST**2)
     entropies = [gaussian_entropy(expected_covariance(mean, covariance, path, sensors) + fine) for path in paths]

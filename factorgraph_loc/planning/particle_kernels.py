@@ -54,8 +54,8 @@ def covariances(poses: Array, index: Places, weights: Array32, out: Array) -> No
     """Compute J weighted covariances of (x, y, heading) of M particles.
 
     ``poses`` (S, M, 3): the particles at S stations, the points of a path at which the belief is evaluated. ``index``
-    (J,): the station of each covariance. ``weights`` (J, M): the weights of the particles for each covariance. ``out``
-    (J, 3, 3): output. Headings are computed relative to the heading of the first particle.
+    (J,): the index of the station of each covariance. ``weights`` (J, M): the weights of the particles for each
+    covariance. ``out`` (J, 3, 3): output. Heading differences are wrapped to (-pi, pi].
     """
     count = poses.shape[1]
     d = np.empty(3)
@@ -83,10 +83,11 @@ def covariances(poses: Array, index: Places, weights: Array32, out: Array) -> No
 
 @compiled
 def cell_entropies(poses: Array, index: Places, weights: Array32, cell: Array, dims: int, out: Array) -> None:
-    """Compute J entropies [nats] of histograms of M particles.
+    """Compute the entropies [nats] of J weighted histograms of M particles.
 
-    ``poses``, ``index``, ``weights``: as in :func:`covariances`. ``cell`` (3,): the size of a cell in x, y and heading.
-    ``dims``: the number of leading coordinates that are considered. ``out`` (J,): output.
+    ``poses`` (S, M, 3): the particles at S stations of a path. ``index`` (J,): the index of the station of each
+    histogram. ``weights`` (J, M): the weights of the particles in each. ``cell`` (3,): the size of a cell in x, y and
+    heading. ``dims``: the number of leading coordinates that are considered. ``out`` (J,): output.
     """
     stations, count, _ = poses.shape
     volume = 0.0
@@ -113,8 +114,9 @@ def cell_entropies(poses: Array, index: Places, weights: Array32, cell: Array, d
 
 @compiled
 def _number_cells(poses: Array, cell: Array, dims: int, out: Places) -> None:
-    """Write the number of the histogram cell of each of the particles ``poses`` (M, 3) to ``out`` (M,). Numbers are
-    below M. ``cell`` (3,): the size of a cell. ``dims``: the number of leading coordinates that are considered."""
+    """Write to ``out`` (M,) the index of the histogram cell that contains each of the particles ``poses`` (M, 3).
+    Indices are below M. Particles in the same cell have the same index. ``cell`` (3,): the size of a cell. ``dims``:
+    the number of leading coordinates that are considered."""
     count = len(poses)
     size = 1
     while size < 4 * count:

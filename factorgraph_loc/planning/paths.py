@@ -104,8 +104,8 @@ def waypoint_paths(
 
     ``pose`` (3,), ``targets`` (K, 2) [m]: start and targets in the world frame. The robot turns in place at the start
     and at corners. A start that is too close to a wall is replaced by the nearest free cell. Targets outside of free
-    space, and those in the cell of the robot, are left out. ``nearest``: the largest number of paths, to the nearest
-    targets. ``beyond``, ``within`` [m]: only targets at distances between these values are used.
+    space, or in the same grid cell as the robot, are left out. ``nearest``: the largest number of paths, to the nearest
+    targets; None means all. ``beyond``, ``within`` [m]: only targets at distances between these values are used.
     """
     start = _nearest_cell(space, pose[:2])
     ends = space.cells(np.asarray(targets, dtype=float).reshape(-1, 2))

@@ -81,11 +81,12 @@ Policy = Callable[[Situation], Choice]
 
 
 def information(s: Situation, sign: float = 1.0) -> Choice:
-    """Choose the path with the largest expected information. If ``sign`` is -1, prefer the smallest, for comparison.
+    """Return the choice of the path with the largest expected information. If ``sign`` is -1, the smallest is
+    preferred, for comparison.
 
-    Short candidates (arcs, straight paths, a turn in place) are evaluated first. If none gains enough for its length
-    and the belief has few modes, the candidates to distant places are evaluated. If these are not informative either,
-    or if the pose is unknown, :func:`patrol` chooses.
+    Short candidates (arcs, straight paths, a turn in place) are evaluated first. Candidates to distant places are
+    evaluated if each short one gains less than its length costs, and the belief has few modes. If these are not
+    informative either, or if the pose is unknown, :func:`patrol` chooses.
     """
     settings = s.settings.policy
     if not s.sensors.forecasts or not s.candidates:
@@ -111,7 +112,8 @@ def information(s: Situation, sign: float = 1.0) -> Choice:
 
 
 def _near_gains(s: Situation, paths: Sequence[Path]) -> Array:
-    """Return the expected reduction of the belief's entropy (C,) [nats] on each of C short paths."""
+    """Return the expected reduction of the belief's entropy (C,) [nats] on each of C short ``paths``. ``s``: has the
+    belief and the sensor models."""
     samples = s.settings.policy.samples
     gains = expected_gain(s.sensors, s.particles, s.weights, paths, s.rng, samples=samples, space=s.space)
     if len(s.modes) != 1:
@@ -122,11 +124,11 @@ def _near_gains(s: Situation, paths: Sequence[Path]) -> Array:
 
 
 def _far_gains(s: Situation, paths: Sequence[Path]) -> Array:
-    """Return the expected information (C,) [nats] of C paths to distant places. With one mode it is about the pose.
-    With several modes it is about which mode is true.
+    """Return the expected information (C,) [nats] of C paths to distant places. If the belief has one mode, this is
+    information about the pose. If it has several modes, it is information about which mode is true.
 
-    The information about poses is then ignored. On a long path particles diverge and run into walls, which the real
-    robot avoids by planning again.
+    Information about the pose is ignored with several modes: on a long path, simulated particles diverge and run into
+    walls. The real robot plans again and avoids this.
     """
     if len(s.modes) == 1:
         (mode,) = s.modes
@@ -146,14 +148,14 @@ def _far_gains(s: Situation, paths: Sequence[Path]) -> Array:
 
 
 def _costs(s: Situation, rows: Sequence[int], per_metre: float) -> Array:
-    """Return the penalties (K,) [nats] on the lengths of the candidates with indices ``rows``. ``per_metre``:
-    nats/m."""
+    """Return the penalties (K,) [nats] for the lengths of K candidate paths. ``rows``: the indices of the paths in
+    ``s.candidates``. ``per_metre`` [nats/m]: the penalty for one metre."""
     return per_metre * np.array([s.candidates[i].length for i in rows])
 
 
 def random(s: Situation) -> Choice:
-    """Choose at random among the candidates except paths to distant places, and follow the path to its end. The
-    candidates are arcs, straight paths and a turn in place."""
+    """Return a random choice of an arc, a straight path or a turn in place, to be followed to its end. Candidates that
+    lead to distant places are excluded."""
     arcs = [p for p in s.candidates if p.kind != FAR]
     if not arcs:
         return NO_PATH
@@ -163,8 +165,8 @@ def random(s: Situation) -> Choice:
 
 
 def patrol(s: Situation) -> Choice:
-    """Drive straight ahead until a wall is near, then choose the direction with the most free space. Turn back only if
-    no other direction is free."""
+    """Return the choice to drive straight ahead until a wall is near. Near a wall, choose the direction with the
+    longest free path, and turn back only if no other direction is free."""
     straight = [(i, p) for i, p in enumerate(s.candidates) if _is_straight(p)]
     if not straight:
         return NO_PATH
@@ -185,7 +187,8 @@ def patrol(s: Situation) -> Choice:
 
 
 def nearest_tags(s: Situation) -> Choice:
-    """Choose the path with the smallest mean distance from its end to the nearest tags, averaged over the belief."""
+    """Return the choice of the path whose end has the smallest mean distance to its nearest tags, averaged over the
+    belief."""
     if not len(s.sensors.goals) or not s.candidates:
         return patrol(s)
     rows = s.rng.choice(len(s.weights), s.settings.policy.samples, p=s.weights / s.weights.sum())
@@ -210,10 +213,10 @@ def policy(name: str) -> Policy:
 
 
 def usable(paths: Sequence[Path], free: Array, sight: float) -> tuple[tuple[Path, ...], Array]:
-    """Return the paths that are free of walls in their first metre, and their free lengths [m] as an array.
+    """Return the ``paths`` that are free of walls in their first metre, and their free lengths [m] as an array.
 
-    ``free`` (C,) [m]: the free length of each of C ``paths``. ``sight`` [m]: the range of the proximity sensor. A path
-    that is not free up to this range is shortened to its free length.
+    ``free`` (C,) [m]: the length of each of C ``paths`` before the first wall. ``sight`` [m]: the range of the
+    proximity sensor. A path with a free length below ``sight`` is cut at this length.
     """
     keep = [i for i, p in enumerate(paths) if free[i] >= min(AHEAD, p.length, sight) - 1e-9]
     return tuple(paths[i].until(float(free[i])) if free[i] < sight else paths[i] for i in keep), free[keep]

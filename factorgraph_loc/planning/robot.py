@@ -158,7 +158,7 @@ class SimulatedRobot:
             yield from self._passed(reported)
 
     def wait(self, seconds: float) -> Iterator[Measurement]:
-        """Stand still for about ``seconds`` [s]. Yields the measurements in this time."""
+        """Stand still for ``seconds`` [s], rounded to control periods. Yields the measurements in this time."""
         for _ in range(max(1, round(seconds / PERIOD))):
             yield from self._passed(np.zeros(3))
 
@@ -179,8 +179,8 @@ class SimulatedRobot:
                 yield m if kind_of(channel) == channel else replace(m, source=channel)  # type: ignore[type-var]
 
     def _reported_motions(self, path: Array, metres: float) -> Array:
-        """Return the motions (N, 3) in N control periods along at most ``metres`` [m] of a path, as odometry reports
-        them. Each is in the frame of the robot before the motion."""
+        """Return the motions (N, 3) in N control periods that follow ``path`` for at most ``metres`` [m]. Odometry
+        reports exactly these motions. Each is in the frame of the robot before the motion."""
         twists = se2.log(se2.between(path[:-1], path[1:]))
         lengths = np.hypot(twists[:, 0], twists[:, 1])
         seconds = np.maximum(lengths / self._settings.speed, np.abs(twists[:, 2]) / self._settings.turn_rate)
@@ -194,7 +194,7 @@ class SimulatedRobot:
         return se2.between(at[:-1], at[1:])
 
     def _is_free(self, target: Array) -> bool:
-        """True if the cell of ``target`` (3,) is free. If the robot is in a cell that is too close to a wall, also True
-        if the target is not nearer to a wall."""
+        """True if the grid cell of ``target`` (3,) is free. If the robot itself is too close to a wall, the target must
+        only be as far from walls as the robot."""
         ahead = Path(np.stack((np.zeros(3), se2.between(self.pose, target))), "step")
         return bool(free_steps(self._space, self.pose[None], [ahead])[0, 0])
