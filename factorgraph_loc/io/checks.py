@@ -52,7 +52,9 @@ def _require(where: str, column: Column, t: Array, values: Array) -> None:
 
 
 def require_one_span(log: Log) -> None:
-    """Raise InputError if two times of a log, including its start pose, differ by more than :data:`MAX_SPAN`."""
+    """Raise InputError if two timestamps of a log differ by more than :data:`MAX_SPAN`.
+
+    The timestamps are those of all measurements and of the known start pose."""
     filled = {name: stream.t for name, stream in log.streams.items() if len(stream.t)}
     if not filled:
         return
@@ -64,10 +66,10 @@ def require_one_span(log: Log) -> None:
     if outlier := find_outlier(list(filled.values()), MAX_SPAN):
         table, i, middle = outlier
         name, t = list(filled.items())[table]
-        where = f"{log.name}: row {i + 1} of {name} has a timestamp {t[i] - middle:+.0f} s from most others"
-        raise InputError(f"{where}, expected {expected}: do their clocks agree?")
+        where = f"{log.name}: row {i + 1} of {name} has a timestamp {t[i] - middle:+.0f} s from the median timestamp"
+        raise InputError(f"{where}, expected {expected}: check the clock of {name}")
     if log.start is not None and not last - MAX_SPAN <= log.start.t <= first + MAX_SPAN:
-        raise InputError(f"{log.name}: the start is {log.start.t:.0f} s after the first timestamp, expected {expected}")
+        raise InputError(f"{log.name}: the start pose is {log.start.t:.0f} s after the first timestamp, expected {expected}")
 
 
 def long_gaps(t: Array) -> tuple[tuple[float, float], ...]:

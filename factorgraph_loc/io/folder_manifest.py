@@ -51,7 +51,7 @@ APART = 5.0  # s: maximum gap between the time spans of two tables; at a larger 
 
 @dataclass
 class _Roles:
-    """The tables of a folder with their proposed uses. ``tables``: by the use, such as ``odometry``. ``remarks``: hints
+    """The tables of a folder with their proposed uses, as {use: table}, such as {"odometry": ...}. ``remarks``: hints
     for the user."""
 
     tables: dict[str, Guess] = field(default_factory=dict)
@@ -144,10 +144,10 @@ def _map_in_parent(path: Path, roles: _Roles) -> list[str]:
 
 
 def _map_settings(role: str, roles: _Roles) -> dict[str, Any]:
-    """Return settings for the table of tags or landmarks in ``roles``, as lines of a world file. ``role``: "tags" or
-    "landmarks".
+    """Return the lines of a world file that describe the tags or landmarks in ``roles``, as {key: value}.
 
-    If the EPCs in the map and in the reads differ in letter case, a setting converts the EPCs of the map."""
+    ``role``: "tags" or "landmarks". If the EPCs in the map and in the reads differ in letter case, a setting converts
+    the EPCs of the map."""
     table, reads = roles.tables[role], roles.tables.get("rfid")
     settings = table.mapping(FIELDS[role])
     if role == "tags" and reads is not None:
@@ -296,10 +296,9 @@ def _reference(roles: _Roles, path: Path) -> Trajectory | None:
 
 
 def _lengths(t: Array, counted: Array, reference: Trajectory) -> tuple[float, float]:
-    """Return the length of the reference [m], and the sum of the absolute changes of the encoder counts.
+    """Return the path length of the ``reference`` [m], and the sum of the absolute changes of the encoder counts.
 
-    ``t`` (N,): times [s]. ``counted`` (N,): encoder counts. Only the time that both have in common is used, if there is
-    any."""
+    ``t`` (N,): times [s]. ``counted`` (N,): encoder counts. If the times of both overlap, only the overlap is used."""
     during = (t >= reference.t[0]) & (t <= reference.t[-1])
     of_reference = (reference.t >= t[0]) & (reference.t <= t[-1])
     if not during.any() or not of_reference.any():
@@ -346,7 +345,8 @@ def _turns(role: str, roles: _Roles, path: Path) -> Turns | None:
 def _add_clocks(options: dict[str, Any], roles: _Roles, path: Path) -> None:
     """Add clock offsets to the ``options`` of tables with times that do not overlap the times of most other tables.
 
-    An offset aligns the turns of the robot in two tables. If no alignment is clearly best, both tables begin together.
+    An offset aligns the turns of the robot in two tables. If no alignment is clearly best, the offset gives both tables
+    the same first time.
     """
     starts = {role: float(np.nanmin(table.times())) for role, table in roles.tables.items() if table.has("t")}
     ends = {role: float(np.nanmax(roles.tables[role].times())) for role in starts}

@@ -143,7 +143,7 @@ class Guess:
         return not self.header and self.separator == " " and self.has("qw") and self.units.get("t") == "s"
 
     def has(self, *names: str) -> bool:
-        """True if the table has all these fields."""
+        """True if the table has all fields ``names``."""
         return all(name in self.fields for name in names)
 
     def mapping(self, names: Sequence[str]) -> dict[str, Any]:

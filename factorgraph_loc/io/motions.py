@@ -93,8 +93,9 @@ def between_poses(
     """Return the motions (N - 1, 3) from each odometry pose to the next one: x, y [m] and heading [rad].
 
     A motion is in the body frame of the pose that it begins at. ``poses`` (N, 3): x, y, heading. ``t_ns`` (N,): their
-    timestamps. At a reset of the odometry to the origin, the motion before it is repeated. Then a warning about
-    ``source`` is appended to ``warnings``. ``lost_ns``: timestamps at which the device had no pose.
+    timestamps. If the odometry is reset to the origin, the motion across the reset is unknown. The returned motion then
+    continues the velocity before the reset, and a warning about ``source`` is appended to ``warnings``. ``lost_ns``:
+    timestamps at which the device had no pose.
     """
     moves = se2.between(poses[:-1], poses[1:])
     durations = _durations(t_ns)
@@ -114,8 +115,9 @@ def bridge_losses(t_ns: Integers, moves: Array, lost_ns: Integers) -> tuple[Inte
 
     ``moves`` (N - 1, 3): motions x, y [m], heading [rad] between valid poses at the timestamps ``t_ns`` (N,).
     ``lost_ns``: timestamps without a pose. An increment is the motion since the previous timestamp, and the part [s] of
-    that time without a pose. Without a pose, the last motion is assumed to continue for at most :data:`HOLD_TIME`. If
-    no pose is lost, ``t_ns`` and increments (N, 3) are returned.
+    that time without a pose. Without a pose, the last velocity is assumed for at most :data:`HOLD_TIME`, then no
+    motion. The increment at the next valid pose corrects the sum. If no pose is lost, ``t_ns`` and increments (N, 3)
+    are returned.
     """
     lost = np.setdiff1d(lost_ns[lost_ns > t_ns[0]], t_ns)
     if not len(lost):
@@ -154,7 +156,8 @@ def wheel_motions(source: object, t_ns: Integers, distances: Array, scales: Arra
     """Return the distances (N - 1, W) [m] that W wheels roll between N timestamps ``t_ns`` [ns].
 
     ``distances`` (N, W): the total distances [m] by the encoders. ``scales`` (W,): metres per encoder count, to correct
-    encoders that wrap. At a reset to zero the previous motion is repeated, and a warning is appended to ``warnings``.
+    encoders that wrap. If the encoders are reset to zero, the distance across the reset continues the speed before it.
+    Then a warning about the file ``source`` is appended to ``warnings``.
     """
     steps = np.stack([wheel_steps(distances[:, i], float(scale)) for i, scale in enumerate(scales)], axis=-1)
     durations = _durations(t_ns)
@@ -240,9 +243,10 @@ def _largest_before(rates: Array, least: float) -> Array:
 
 
 def _continued(source: object, t_ns: Integers, steps: Array, resets: Integers, warnings: list[Notice]) -> Array:
-    """Return the ``steps`` (N - 1, D), with the steps at the indices ``resets`` replaced by the motion before them.
+    """Return the ``steps`` (N - 1, D) between N timestamps ``t_ns``. Steps at the indices ``resets`` are unknown.
 
-    If there are resets, a warning that names the file ``source`` is appended to ``warnings``."""
+    They are replaced by the step before each, scaled to their duration, but to at most :data:`HOLD_TIME`. If there are
+    resets, a warning that names the file ``source`` is appended to ``warnings``."""
     durations = _durations(t_ns)
     for i in resets.tolist():
         previous = steps[i - 1] / durations[i - 1] if i else np.zeros(steps.shape[1])

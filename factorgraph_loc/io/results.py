@@ -29,11 +29,11 @@ FILES = (FINAL, CAUSAL, ESTIMATES, INNOVATIONS, LEARNT, EVENTS, CONFIG, METRICS)
 
 @dataclass(frozen=True)
 class Estimates:
-    """The estimated poses of a stored run: causal ones, which use earlier measurements only, or final ones, which use
-    the whole log.
+    """The estimated poses of a stored run: causal ones from the measurements before each pose, or final ones from the
+    whole log.
 
-    ``trajectory``: N estimated poses. ``errors``: arrays (N,) by the names in :data:`ERRORS`: the errors of position
-    [m] and heading [rad], and the normalised estimation error squared. An unknown error is NaN.
+    ``trajectory``: N estimated poses. ``errors``: arrays (N,) with the keys "error_position" [m], "error_heading" [rad]
+    and "nees", the normalised estimation error squared. An unknown error is NaN.
     """
 
     trajectory: Trajectory
@@ -55,11 +55,11 @@ class Estimates:
 
 @dataclass(frozen=True)
 class ResultFiles:
-    """The files of a stored run.
+    """The files of a stored run. Methods raise InputError if a file is damaged.
 
-    ``read``: a function that returns the content of a file by its name.
-    ``t0_ns``: the absolute time of t = 0 [ns]. If it is None, the first estimate is at t = 0, and events and innovations
-    have absolute times. ``folder``: the folder to name in errors. Methods raise InputError if a file is damaged.
+    ``read``: a function that returns the content of a file by its name. ``folder``: the folder to name in errors.
+    ``t0_ns``: the absolute time of t = 0 [ns]. If it is None, the first estimate is at t = 0, and the times of events
+    and innovations are absolute [s].
     """
 
     read: Callable[[str], bytes]
@@ -67,9 +67,9 @@ class ResultFiles:
     folder: Path = Path()
 
     def estimates(self) -> dict[str, Estimates]:
-        """Return the estimates of a run: "causal" from earlier measurements only, and "final" from the whole log.
+        """Return {"causal": estimates, "final": estimates} of a run. Causal estimates use only earlier measurements.
 
-        Causal estimates before the first localization are omitted.
+        Final estimates use the whole log. Causal estimates before the first localization are omitted.
         """
         source = self.folder / ESTIMATES
         table = parse_parquet(self.read(ESTIMATES), source, list(COLUMNS))
@@ -88,7 +88,9 @@ class ResultFiles:
             raise InputError(f"{source}: contains no valid trajectory: {error_text(error)}") from error
 
     def innovations(self) -> dict[str, Array]:
-        """Return by sensor an array (K, 3): time [s], normalised innovation squared and degrees of freedom."""
+        """Return {sensor: array (K, 3)} with one row for each of K updates by the sensor.
+
+        The columns are the time [s], the normalised innovation squared, and its degrees of freedom."""
         table = parse_parquet(self.read(INNOVATIONS), self.folder / INNOVATIONS)
         table = table.select("sensor", (pl.col(STAMP) - (self.t0_ns or 0)) / 1e9, "nis", "dof")
         groups = table.group_by("sensor", maintain_order=True)

@@ -74,9 +74,9 @@ def _reference(log: str) -> PosePath:
 def write_trajectory(trajectory: Trajectory | PosePath, path: str | Path, t0_ns: int = 0) -> list[Path]:
     """Write a trajectory in TUM format, or in KITTI format if ``path`` ends with .kitti. Returns the written files.
 
-    ``t0_ns``: the absolute time [ns] of t = 0 of a planar trajectory, for TUM format. In KITTI format, times [s] since
-    t = 0 are written to ``NAME.times.txt``. Its poses are those of the robot (x forward, z up) in the frame of
-    ``trajectory``, not of a camera.
+    ``t0_ns``: the absolute time [ns] of t = 0 of a planar trajectory, for TUM format. For KITTI format, times [s] since
+    t = 0 are written to ``NAME.times.txt``. The written KITTI poses are those of the robot (x forward, z up), not of a
+    camera. They are in the frame of ``trajectory``.
     """
     path = Path(path)
     if path.suffix != ".kitti":

@@ -105,7 +105,7 @@ def test_what_no_reader_looked_at_is_found_in_the_log(native, one):
     with pytest.raises(InputError, match=r"hall: odometry at 0.500 s: dx is 2000.0, expected a finite number of m"):
         require_bounds(replace(log, streams={"odometry": moves}))
     with pytest.raises(
-        InputError, match=r"hall: the start is -1700000000 s after the first timestamp, expected one at"
+        InputError, match=r"hall: the start pose is -1700000000 s after the first timestamp, expected one at"
     ):
         require_one_span(replace(log, start=StartPose(-1.7e9, np.zeros(3), np.ones(3))))
     with pytest.raises(InputError, match=r"hall: start at 0.000 s: x is 1e\+300, expected"):

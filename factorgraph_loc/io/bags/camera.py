@@ -65,8 +65,9 @@ class CameraTopic(TopicSettings):
 class Images:
     """Collects the images of a ROS topic while its bag is read.
 
-    ``known``: True if all images are already in the cache folder; then the messages are not read. Newly extracted
-    images are in a temporary folder, which is deleted when ``stack`` is closed.
+    ``name``: the topic. ``stamper``: chooses the timestamps of its messages. ``known``: True if the cache folder
+    already has all images. The messages are then not needed. New images are in a temporary folder, which is deleted
+    when ``stack`` is closed.
     """
 
     def __init__(self, bag: Bag, name: str, stamper: Stamper, stack: ExitStack) -> None:

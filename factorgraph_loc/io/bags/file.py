@@ -50,7 +50,7 @@ HINTS = {
 
 @cache
 def limit_unpacking() -> None:
-    """Replace the decompression functions in all readers of ``rosbags`` by functions that limit the unpacked size."""
+    """Limit the unpacked size of compressed bags. Replaces the decompression functions in all readers of ``rosbags``."""
     import lz4.frame  # type: ignore[import-untyped] # noqa: PLC0415 - optional libraries
     from rosbags.rosbag1 import reader as reader1  # noqa: PLC0415
     from rosbags.rosbag2 import reader as reader2  # noqa: PLC0415
@@ -271,9 +271,10 @@ def require_rosbags() -> None:
 
 @lru_cache(maxsize=64)
 def _store(msgtype: str, definition: MessageDefinition) -> Typestore:
-    """Return the compiled message types of a ``definition``. ``msgtype``: the name of the message type that it defines.
+    """Return a rosbags type store with the message type ``msgtype`` and the types that it contains.
 
-    Compilation takes a hundred times as long as reading a message. The result is therefore cached for all topics and bags.
+    ``definition``: the text in the bag that defines these types. Its compilation takes a hundred times as long as
+    reading a message. Therefore the last 64 results are cached.
     """
     from rosbags.interfaces import MessageDefinitionFormat  # noqa: PLC0415
     from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore  # noqa: PLC0415

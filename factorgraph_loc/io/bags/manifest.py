@@ -88,7 +88,9 @@ class Uses:
             self.remarks.append(f"{sensor} could also be {', '.join(topic.name for topic in topics[1:])}")
 
     def take_all(self, sensor: str, topics: Mapping[str, Mapping[str, Any]]) -> None:
-        """Propose each topic as a sensor of its own, of the kind ``sensor``. ``topics``: the settings by topic."""
+        """Propose each topic as a sensor of its own, of the kind ``sensor``, such as "bearing_range".
+
+        ``topics``: the proposed options of each sensor, by the name of its topic."""
         names = distinct(list(topics)) if len(topics) > 1 else []
         settings = {topic: {"topic": topic, **more} for topic, more in topics.items()}
         if names:
@@ -124,8 +126,9 @@ def manifest_of_bag(bag: Path, folder: Path) -> BagManifest:
 
 
 def propose(bag: Bag) -> Uses:
-    """Return a proposed use of each topic. If several fit one sensor, the likeliest is used and a remark lists the
-    rest."""
+    """Return a proposed use of each topic of a bag, such as "odometry".
+
+    If several topics fit one sensor, the likeliest topic is used, and a remark lists the rest."""
     out = Uses()
     topics = [topic for topic in bag.topics.values() if topic.count]
     tree = tree_of(bag, out.remarks)
@@ -162,9 +165,10 @@ def propose(bag: Bag) -> Uses:
 
 
 def _motion(out: Uses, bag: Bag, topics: Sequence[Topic], tree: Tree) -> None:
-    """Add the topic of odometry among ``topics`` to ``out``. ``tree``: the coordinate frames of the bag.
+    """Add the proposed topic of odometry to ``out``, or a remark if none of ``topics`` measures odometry.
 
-    Messages of type Odometry are preferred, then tf with an odometry frame, Twist, and JointState."""
+    Messages of type Odometry are preferred, then tf with an odometry frame, Twist, and JointState. ``tree``: the
+    coordinate frames of the bag."""
     robot = tree.robot()
     origin = None if robot is None else tree.above(robot, ORIGINS)
     frames = {} if origin is None else {"parent": origin, "child": robot}
@@ -264,7 +268,9 @@ def _reference(out: Uses, bag: Bag, topics: Sequence[Topic], tree: Tree) -> None
 
 
 def _never_turns(bag: Bag, topic: Topic) -> bool:
-    """True if a topic of poses has at least three messages, and the first messages all have the same orientation."""
+    """True if the first :data:`SAMPLE` messages of a topic of poses have the same orientation.
+
+    False if the topic has fewer than three messages."""
     get = attrgetter(f"{POSES[topic.type]}.{'rotation' if topic.type.endswith('TransformStamped') else 'orientation'}")
     turned = [get(item.message) for item in islice(bag.messages([topic.name]), SAMPLE)]
     return len(turned) > 2 and len({(q.x, q.y, q.z, q.w) for q in turned}) == 1
@@ -361,7 +367,7 @@ def range_fields(paths: Sequence[str]) -> dict[str, str]:
 
 
 def read_fields(paths: Sequence[str]) -> dict[str, str]:
-    """Return the paths of the message fields of an RFID read, with the keys "epc", "antenna", "rssi" and so on.
+    """Return the paths of the message fields of an RFID read, by keys such as "epc", "antenna" and "rssi".
 
     ``paths``: the paths of all fields of the message type. Fields are recognised by common names.
     """

@@ -179,8 +179,9 @@ def odometry(listeners: Listeners, options: OdometryTopic, static: StaticFrames)
     """Register a collector of messages for the odometry topic, and return a function that computes odometry from them.
 
     Call the function after the bag is read, with a list that receives warnings. It returns timestamps (N,) [ns] and
-    either velocities (N, 2) or increments (N, 3 or 4). ``listeners``: the collectors of the bag. ``static``: its static
-    transforms. Raises InputError if the options do not fit the message type.
+    either velocities (N, 2) or increments (N, 3 or 4). ``listeners``: the collectors of the bag. ``options``: the
+    settings of the topic. ``static``: the static transforms of the bag. Raises InputError if the options do not fit the
+    message type.
     """
     bag, source = listeners.bag, f"{listeners.bag.path} {options.topic}"
     known = () if options.wheels else sorted({*POSES, *TWISTS, JOINTS, *TF})
@@ -213,9 +214,9 @@ def odometry(listeners: Listeners, options: OdometryTopic, static: StaticFrames)
 def _velocities(rows: TopicRows, warnings: list[Notice]) -> tuple[Integers, Array]:
     """Return the timestamps (N,) [ns] and the velocities (N, 2): forward [m/s] and turn rate [rad/s].
 
-    ``rows``: two velocities, and optionally a quaternion and the variances of x and y. Null quaternions or variances
-    mean that the device had lost its pose. Then a warning is appended to ``warnings``, and the result of
-    :func:`motions.bridge_losses` is returned: timestamps and increments (M, 4)."""
+    ``rows``: rows of two velocities, and optionally a quaternion and the variances of x and y. Null quaternions or
+    variances mean that the device had lost its pose. The timestamps and increments (M, 4) of
+    :func:`motions.bridge_losses` are then returned instead, and a warning is appended to ``warnings``."""
     values = rows.values
     null = np.zeros(len(rows), dtype=bool)
     if values.shape[1] > 2:
@@ -248,7 +249,10 @@ def _of_poses(listeners: Listeners, options: OdometryTopic, static: StaticFrames
 
 
 def _of_wheels(listeners: Listeners, options: OdometryTopic, wheels: WheelSettings) -> Motion:
-    """Register collectors of ``wheels`` at ``listeners``. Return a function that computes odometry from the wheels."""
+    """Register collectors of ``wheels`` at ``listeners``. Return a function that computes odometry from the wheels.
+
+    Call the function with a list that receives warnings. It returns timestamps (N,) [ns] and velocities (N, 2) or
+    increments (N, 3)."""
     bag = listeners.bag
     if (wheels.base is not None or len(wheels.joints) == 3) and len(wheels.joints) != 4:
         raise InputError(

@@ -114,12 +114,12 @@ def checked_rotations(source: str, rows: Integers, table: Array) -> Array:
 
 
 def path_of(rows: TopicRows, warnings: list[Notice], *, has_rotations: bool = True) -> PosePath:
-    """Return the poses in ``rows``, which were collected from a topic.
+    """Return the poses in ``rows``, the rows collected from a topic. Of rows with equal timestamps, the last is used.
 
     The columns are x, y, z [m], then the quaternion x, y, z, w, and optionally the variances of x and y.
-    ``has_rotations``: False if there is no quaternion. Null poses, which a device reports while it has lost its pose,
-    are skipped with a warning in ``warnings``. Of rows with equal timestamps, the last is used. Raises InputError, with
-    the number of the message, at an invalid row.
+    ``has_rotations``: False if there is no quaternion. Null poses mean that the device had lost its pose. They are
+    skipped, and a warning is appended to ``warnings``. Raises InputError, with the number of the message, at an invalid
+    row.
     """
     source, values = rows.source, rows.values
     if not has_rotations:

@@ -70,8 +70,9 @@ class RowsOfTopic:
 
     ``fields``: the path of the message field for each column. ``table``: the description of all columns that the sensor
     has. ``columns``: the columns to collect, by default all except the first, which is the time. ``units``: the unit of
-    a column, or a factor that converts its values to the default unit. ``rules``: whether invalid rows are skipped and
-    late rows sorted; otherwise they are errors. A missing number becomes NaN. An empty name raises InputError.
+    a column, or a factor that converts its values to the default unit. ``rules``: whether invalid rows are skipped, and
+    rows sorted by time. By default an invalid row and a decreasing timestamp are errors. A missing number becomes NaN.
+    An empty name raises InputError.
     """
 
     def __init__(

@@ -51,7 +51,7 @@ class TopicSettings(FileModel):
 
 
 class RowTopic(TopicSettings, RowRules):
-    """Base class of settings of a ROS topic. Invalid messages may be skipped, and late ones sorted."""
+    """Base class of settings of a ROS topic. Invalid messages may be skipped, and messages may be sorted by time."""
 
 
 class Fields:
@@ -149,9 +149,9 @@ def as_number(value: Any) -> float:
 
 
 def as_nanoseconds(value: Any, unit: int) -> int:
-    """Return a timestamp in nanoseconds.
+    """Return a timestamp in nanoseconds. ``value``: a ROS time, or a number in units of ``unit`` nanoseconds.
 
-    ``value``: a ROS time, or a number in units of ``unit`` nanoseconds. Raises ValueError if it is a text without a number.
+    Raises ValueError if ``value`` is a text that is not a number.
     """
     if hasattr(value, "nanosec"):
         return int(value.sec) * 10**9 + int(value.nanosec)
@@ -189,7 +189,8 @@ class TopicRows:
 
     ``source``: the bag and the topic, for errors. ``width``: how many numbers a row has. ``paths``: the fields that
     form the row of a message. Without paths, the caller appends rows. A value that is not a number becomes NaN.
-    ``rules``: whether invalid rows are skipped and late rows sorted; otherwise they are errors.
+    ``rules``: whether invalid rows are skipped, and rows sorted by time. By default an invalid row and a decreasing
+    timestamp are errors.
     """
 
     def __init__(self, source: str, width: int, paths: Sequence[str] = (), rules: RowRules | None = None) -> None:
@@ -229,8 +230,9 @@ class TopicRows:
     def in_order(self, names: Sequence[str], warnings: list[Notice]) -> tuple[Integers, Array]:
         """Return the timestamps (M,) [ns] and the numbers (M, width) of the valid rows, in order of time.
 
-        ``names``: the names of the columns, for errors. A row with a number that is not finite is invalid. Invalid and
-        late rows raise InputError unless ``rules`` skip or sort them. Then warnings are appended to ``warnings``.
+        ``names``: the names of the columns, for errors. A row with a number that is not finite is invalid. Raises
+        InputError at an invalid row or a decreasing timestamp, unless ``rules`` skip or sort such rows. Then warnings
+        are appended to ``warnings``.
         """
         keep = self.kept(checks.not_finite(names, self.values), warnings)
         return self.t_ns[keep], self.values[keep]
@@ -240,8 +242,8 @@ class TopicRows:
         returned.
 
         ``faults``: the invalid cells. ``among``: indices of the rows that ``faults`` describe; other rows are not
-        returned. None: all rows. Raises InputError at an invalid or late row, unless ``rules`` skip or sort it. Then a
-        warning is appended to ``warnings``.
+        returned. None: all rows. Raises InputError at an invalid row or a decreasing timestamp, unless ``rules`` skip
+        or sort such rows. Then a warning is appended to ``warnings``.
         """
         rows, t_ns = self.rows, self.t_ns
         keep = np.arange(len(rows)) if among is None else among

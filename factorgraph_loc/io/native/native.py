@@ -165,7 +165,7 @@ def read_reference(path: Path, t0_ns: int, run: RunFile, warnings: list[Notice])
 def write_native(
     log: Log, folder: str | Path, format: Literal["csv", "parquet"] = "csv", *, overwrite: bool = False
 ) -> None:
-    """Write a log atomically as a folder in the native format of this project.
+    """Write a log atomically as a folder in the native format of this project. ``format``: the file type of the tables.
 
     ``folder`` must be new or empty. With ``overwrite`` it may also contain a log in the native format, which is
     replaced. Timestamps are exact to the nanosecond, numbers to the last digit. Images are copied. Limitations:

@@ -77,10 +77,10 @@ def load(
     """Return the logs that ``log`` refers to.
 
     ``log``: a manifest, a folder in the native format or its ``run.toml``, the name of a shipped data set, or a
-    ``Log``. With ``reader``, any path that the reader can read. ``options``: options of the reader, overriding the
-    manifest. A list, or a text with commas, gives one log per value. ``rig``, ``world``: values or files that replace
-    the rig and the world of the log. ``data_root``: the folder of data sets; by default the environment variable
-    FGLOC_DATA. Raises InputError with a message of one line about what is invalid.
+    ``Log``. ``reader``: if given, ``log`` is any path that this reader can read. ``options``: options of the reader,
+    overriding the manifest. An option whose value is a list, or a text with commas, gives one log per element. ``rig``,
+    ``world``: values or files that replace the rig and the world of the log. ``data_root``: the folder of data sets; by
+    default the environment variable FGLOC_DATA. Raises InputError with a message of one line about what is invalid.
     """
     if isinstance(log, Log):
         return [replace(log, rig=_value(rig, read_rig) or log.rig, world=_value(world, read_world) or log.world)]
@@ -130,8 +130,10 @@ def read_log(
     rig: RigLike | None = None,
     world: WorldLike | None = None,
 ) -> Log:
-    """Return the log that ``log`` refers to. The arguments are those of :func:`load`. Raises InputError if there are
-    several."""
+    """Return the one log that ``log`` refers to: a manifest, a folder in the native format, or a shipped data set.
+
+    ``reader``, ``options``: the reader and its options, overriding the manifest. ``rig``, ``world``: replace those of
+    the log. ``data_root``: the folder of data sets, by default FGLOC_DATA. Raises InputError if there are several logs."""
     logs = load(log, data_root=data_root, reader=reader, options=options, rig=rig, world=world)
     if len(logs) > 1:
         raise InputError(f"{log} refers to {len(logs)} logs, expected one: {listed(loaded.name for loaded in logs)}")

@@ -76,7 +76,9 @@ def read_manifest(file: Path) -> Manifest:
 
 
 def describe(data_root: str | Path | None = None) -> list[Dataset]:
-    """Return the shipped data sets, sorted by name. Raises InputError if the given ``data_root`` does not exist."""
+    """Return the shipped data sets, sorted by name. ``data_root``: the folder of their files, by default FGLOC_DATA.
+
+    Raises InputError if the folder does not exist."""
     datasets = []
     for name, file in manifests().items():
         m = read_manifest(file)
@@ -95,7 +97,9 @@ def is_present(manifest: Manifest, file: Path, data_root: str | Path | None) -> 
 
 
 def verify(manifest: Manifest, data_root: str | Path | None = None) -> list[str]:
-    """Compare files with the checksums in a manifest. Return a line about each missing or modified file."""
+    """Return a line of text about each file that is missing or differs from its sha256 in ``manifest.checksums``.
+
+    ``data_root``: the folder of the files, by default the environment variable FGLOC_DATA."""
     if not manifest.checksums:
         return []
     root = find_data_root(data_root, manifest.title)

@@ -69,8 +69,8 @@ def read_odometry(folder: TableFolder, options: OdometryFile) -> tuple[Integers,
     """Return the timestamps (N,) [ns] of the odometry, and its velocities (N, 2) or increments (N, 3 or 4).
 
     A velocity is forward [m/s] and turn rate [rad/s]. An increment is x, y [m] and heading [rad] since the previous
-    timestamp. Its optional fourth column is the time [s] with lost poses. Raises InputError with file and row of an
-    invalid value.
+    timestamp. Its optional fourth column is the part [s] of this time without a valid pose. ``options``: describe the
+    file in ``folder``. Raises InputError with file and row of an invalid value.
     """
     path, warnings = folder.file(options.file), folder.warnings
     if options.is_in_format():
@@ -149,9 +149,10 @@ def _with_poses(mapped: Cells, options: PosesFile, warnings: list[Notice]) -> tu
 
 
 def _in_format(folder: TableFolder, options: PosesFile) -> tuple[Integers, Array, Integers]:
-    """Return timestamps (N,) [ns] and planar poses (N, 3) of a TUM, KITTI or EuRoC file, and timestamps of null poses.
+    """Return timestamps (N,) [ns], poses (N, 3) and timestamps of null poses of a TUM, KITTI or EuRoC file.
 
-    A null pose means that the device had lost its pose."""
+    A pose is x, y [m] and heading [rad]. A null pose means that the device had lost its pose. ``options``: the format,
+    and the name of the file in ``folder``."""
     path = folder.file(options.file)
     if options.columns or options.units:
         raise InputError(f"{path}: format {options.format} defines columns and units: remove columns and units")

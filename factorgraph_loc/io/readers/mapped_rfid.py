@@ -47,9 +47,10 @@ def read_wide(path: Path, mapping: ColumnMapping, antenna: str | None) -> Cells:
     """Return the reads of a table with several columns of signal strengths, whose names match a pattern such as
     ``rssi_*``.
 
-    Each cell that is not empty is a read. The text in place of ``*`` is the antenna's name, or the EPC of the tag if
-    the antenna is known. The antenna is known if ``columns`` has it, or if ``antenna``, the name of the only antenna,
-    is given. Raises InputError at an invalid value.
+    ``mapping``: the columns of the fields; the pattern is the column of ``rssi``. Each cell of a matching column that
+    is not empty is a read. The text in place of ``*`` is the antenna's name, or the EPC of the tag if the antenna is
+    known. The antenna is known if ``mapping`` has a column for it, or if ``antenna``, the name of the only antenna, is
+    given. Raises InputError at an invalid value.
     """
     pattern = mapping.columns["rssi"]
     fixed = {field: column for field, column in mapping.columns.items() if field != "rssi"}
@@ -200,7 +201,7 @@ def _signal(mapped: Cells, name: str) -> Array:
 
 
 def _columns_of(options: RfidFile) -> dict[str, Column]:
-    """Return the descriptions of the fields of reads, without the EPC, by field."""
+    """Return a description of each field of a read except the EPC, by its name, such as "rssi"."""
     known = {name: RFID[name] for name in ("antenna", *SIGNALS)}
     return known | {"channel": _channel(options.channels), "last": STAMP, "count": COUNT}
 
@@ -239,9 +240,10 @@ def _from_base64(text: str) -> str:
 
 
 def _in_sequence(mapped: Cells, options: RfidFile, warnings: list[Notice]) -> Cells:
-    """Return the rows of ``mapped``. Raises InputError at a row whose last read is before its first read.
+    """Return the rows of ``mapped``, each with the times of its first and last read.
 
-    If the options skip invalid rows, such rows are left out instead, and a warning is appended to ``warnings``."""
+    Raises InputError at a row whose last read is before its first read. If the options skip invalid rows, such rows are
+    left out instead, and a warning is appended to ``warnings``."""
     if "last" not in mapped.columns:
         return mapped
     wrong = mapped.stamps("last", options.clock_offset) < mapped.stamps("t", options.clock_offset)

@@ -85,8 +85,9 @@ def _read(
     unit: str | None = None,
     rules: RowRules | None = None,
 ) -> Cells:
-    """Return the cells of a file without header that begins with these ``columns``. ``unit``: the unit of the
-    timestamps. ``rules``: whether invalid rows are skipped and late rows sorted. None: both are errors."""
+    """Return the cells of a file without header that begins with these ``columns``. ``unit``: the unit of the times.
+
+    ``rules``: whether invalid rows are skipped, and rows sorted by time. None: invalid and unsorted rows are errors."""
     numbered = {name: str(i) for i, name in enumerate(columns, start=1)}
     units: dict[str, str | float] = {} if unit is None else {"t": unit}
     form: dict[str, Any] = {"columns": numbered, "units": units, "separator": separator, "header": False}
@@ -97,11 +98,12 @@ def _read(
 
 
 def read_pose_file(path: Path, kind: Format | None = None, rules: RowRules | None = None) -> PosePath:
-    """Return the poses of a file in TUM, KITTI or EuRoC format, and warnings as their attribute ``warnings``.
+    """Return the poses of a file in TUM, KITTI or EuRoC format. Their field ``warnings`` has warnings about it.
 
-    ``kind``: the expected format, by default any. ``rules``: whether invalid rows are skipped and late rows sorted.
-    None: both are errors. Of poses with equal timestamps, the last is used. Null poses, which mean that the pose was
-    lost, are skipped with a warning. Raises InputError with file and row of an invalid value.
+    ``kind``: the expected format, by default any. ``rules``: whether invalid rows are skipped, and rows sorted by time.
+    By default an invalid row and a decreasing timestamp are errors. Of poses with equal timestamps, the last is used.
+    Null poses mean that the device had lost its pose. They are skipped with a warning. Raises InputError with file and
+    row of an invalid value.
     """
     row, first = _first_row(path)
     detected = _format(first)

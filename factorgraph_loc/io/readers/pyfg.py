@@ -182,7 +182,8 @@ def _ranges(ranged: TableRows, numbers: Mapping[str, int], marks: Mapping[str, L
 def _rig(moves: TableRows, ranged: TableRows, durations: Array, warnings: list[Notice]) -> Rig:
     """Return a rig with the noise of odometry and ranges: the median of the noise in the rows ``moves`` and ``ranged``.
 
-    ``durations``: of the motions [s]. If the noise differs between rows, a warning is appended to ``warnings``."""
+    ``durations``: the durations of the motions [s]. If the noise differs between rows, a warning is appended to
+    ``warnings``."""
     per_time = {}
     for name, column in {"along": "cxx", "lateral": "cyy", "heading": "ctt"}.items():
         variance = _positive(moves, column)
