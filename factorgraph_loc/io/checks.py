@@ -69,7 +69,9 @@ def require_one_span(log: Log) -> None:
         where = f"{log.name}: row {i + 1} of {name} has a timestamp {t[i] - middle:+.0f} s from the median timestamp"
         raise InputError(f"{where}, expected {expected}: check the clock of {name}")
     if log.start is not None and not last - MAX_SPAN <= log.start.t <= first + MAX_SPAN:
-        raise InputError(f"{log.name}: the start pose is {log.start.t:.0f} s after the first timestamp, expected {expected}")
+        raise InputError(
+            f"{log.name}: the start pose is {log.start.t:.0f} s after the first timestamp, expected {expected}"
+        )
 
 
 def long_gaps(t: Array) -> tuple[tuple[float, float], ...]:
