@@ -83,7 +83,7 @@ class Belief:
 
 
 def gaussian_belief(estimate: PoseEstimate) -> Belief:
-    """Return a belief with the Gaussian ``estimate`` as its only mode, or with no mode if it is not finite."""
+    """Return a belief with the Gaussian ``estimate`` as its only mode, or without modes if it is not finite."""
     if not np.isfinite(estimate.pose).all():
         return Belief(())
     return Belief((Mode(1.0, np.array(estimate.pose), np.array(estimate.covariance)),))

@@ -25,9 +25,10 @@ class Diagnostics:
 
     ``residuals``: by sensor and quantity (``bearing_range.range`` in m), a list of measurement minus prediction.
     ``nis``: by sensor, a list of (t [s], normalised innovation squared, degrees of freedom) per update. ``ignored``,
-    ``rejected``: counts of detections by reason. ``late``: counts of late measurements by sensor. ``events``: events of
-    the estimator, for example a rebuilt graph. ``doubted``: by kind of error of the map (``moved_tags``), {name of a
-    map element: probability of the error}. ``added``: the list of :meth:`record`, None while nothing is recorded.
+    ``rejected``: counts of unused detections by reason, and of outliers by reason. ``late``: by sensor, the number of
+    measurements that arrived too late to be used. ``events``: events of the estimator, for example a rebuilt graph.
+    ``doubted``: by kind of map error (``moved_tags``), {name of a map element: probability}. ``added``: the list that
+    :meth:`record` returned, None while nothing is recorded.
     """
 
     nis: dict[str, list[tuple[float, float, int]]] = field(default_factory=dict)
@@ -41,11 +42,9 @@ class Diagnostics:
     added: list[Addition] | None = field(default=None, init=False, repr=False, compare=False)
 
     def __str__(self) -> str:
-        """Return a summary: updates of each sensor, with their mean normalised innovation squared (NIS), counts, and
-        events.
-
-        The mean NIS is ideally 1 per degree of freedom.
-        """
+        """Return a summary as text, one line per entry: sensors, counts of unused measurements, and events. The line of
+        a sensor has the number of updates, and the mean normalised innovation squared per degree of freedom. This mean
+        is ideally 1."""
         lines = [
             f"{sensor}: {len(rows)} updates, NIS {sum(nis for _, nis, _ in rows) / max(1, sum(n for *_, n in rows)):.2f} per "
             "degree of freedom"
@@ -57,8 +56,8 @@ class Diagnostics:
         return "\n".join([*lines, *(f"{kind}: {', '.join(names)}" for kind, names in self.doubted.items())])
 
     def ignore(self, reason: str, count: int = 1) -> None:
-        """Add ``count`` to the number of detections that are ignored for a ``reason``. A negative ``count`` cancels an
-        earlier call, if the detections are used after all."""
+        """Add ``count`` to the number of detections that are ignored for the same ``reason``, a short text. A negative
+        ``count`` cancels an earlier call, if the detections are used after all."""
         self.ignored[reason] = self.ignored.get(reason, 0) + count
         if not self.ignored[reason]:
             del self.ignored[reason]
@@ -86,9 +85,11 @@ class Diagnostics:
             self.added.append((self.residuals, name, rows))
 
     def event(self, t: float, kind: str, sentence: str, **fields: Any) -> None:
-        """Record an event at time ``t`` [s], unless it is already recorded.
+        """Append an event at time ``t`` [s] to the list ``events``. An event that is already in the list is not
+        appended.
 
-        ``kind``: the type of the event. ``sentence``: its text, with names of ``fields`` in braces.
+        ``kind``: an identifier of the type of event. ``sentence``: the text of the event, in which names in braces are
+        replaced by ``fields``. For example ``"rebuilt: {why}", why="singular"``.
         """
         event = Event(kind, sentence, fields, t)
         if event not in self.events:
@@ -115,18 +116,15 @@ class Diagnostics:
         )
 
     def record(self) -> list[Addition]:
-        """Start to record additions to these diagnostics. Returns a list that will contain them, for :meth:`take_back`.
-
-        Recording ends when ``added`` is set to None. Limitation: late measurements and events are not recorded.
-        """
+        """Start to record additions to these diagnostics, and return the list to which they will be appended. Pass this
+        list to :meth:`take_back` to undo the additions. Recording ends when ``added`` is set to None. Limitation: late
+        measurements and events are not recorded."""
         self.added = []
         return self.added
 
     def take_back(self, added: Sequence[Addition]) -> None:
-        """Remove earlier additions from these diagnostics, before the same measurements are processed again.
-
-        ``added``: the additions, a list from :meth:`record`. Entries that :meth:`keep_last` has removed are skipped.
-        """
+        """Remove the additions in the list ``added``, which :meth:`record` returned, from these diagnostics. Call this
+        before the same measurements are processed again. Additions that :meth:`keep_last` has deleted are skipped."""
         for totals, name, rows in reversed(added):
             if isinstance(rows, int):
                 totals[name] = totals.get(name, 0) - rows

@@ -25,7 +25,7 @@ RIG_NOTES = "robot"  # key of the metadata: notes about a rig that the reader de
 @dataclass(frozen=True)
 class StartPose:
     """A known start of the robot. ``pose`` (3,): x, y [m], heading [rad] in the world frame at time ``t`` [s].
-    ``sigmas`` (3,): their standard deviations."""
+    ``sigmas`` (3,): standard deviations of x, y [m] and heading [rad]."""
 
     t: float
     pose: Array
@@ -73,20 +73,18 @@ class Log:
         return float(min(a for a, _ in stamps)), float(max(b for _, b in stamps))
 
     def measurements(self, sensors: Sequence[str]) -> Iterator[Measurement]:
-        """Return the measurements of ``sensors`` (names) in order of arrival. Time offsets in the rig are added to
-        timestamps.
-
-        A measurement arrives at its timestamp. A late measurement, which is older than an earlier row of its stream,
-        arrives with that row. At equal times, the attribute ``rank`` of the streams determines the order.
-        """
+        """Yield the measurements of ``sensors`` (names) in order of arrival. The rig's time offsets are added. A
+        measurement arrives at its timestamp, or at the timestamp of an earlier row of its stream if that is larger. At
+        equal times, streams with a lower attribute ``rank`` are first."""
 
         return (m for _, _, _, m in heapq.merge(*self._arrivals(self._in_order(sensors))))
 
     def steps(self, sensors: Sequence[str]) -> Iterator[Measurement]:
-        """Return the measurements like :meth:`measurements`, but with consecutive rows of one stream joined, for speed.
+        """Yield the measurements of ``sensors`` like :meth:`measurements`, but odometry in arrays, for speed.
 
-        Rows of a stream with ``joins`` become one :class:`~factorgraph_loc.model.measurement.Rows` up to the next
-        measurement of another stream. Late rows are not joined.
+        Consecutive rows of the first stream with the attribute ``joins`` are yielded in one
+        :class:`~factorgraph_loc.model.measurement.Rows` object. It ends before the next measurement of another stream.
+        A row that is older than the row before it is yielded alone.
         """
         order = self._in_order(sensors)
         joined = next((rank for rank, name in enumerate(order) if self.streams[name].joins), None)

@@ -70,9 +70,10 @@ class Tick:
 
 @dataclass(frozen=True, slots=True)
 class Rows:
-    """N successive measurements of one stream, joined to one measurement with the time of the last.
+    """N successive measurements of one stream in arrays, which an estimator can process in one call.
 
-    ``kind``: the class of the measurements. ``times`` (N,): their times [s]. ``values``: an array (N,) per field.
+    ``kind``: the class of a measurement. ``times`` (N,): their times [s]. ``values``: an array (N,) for each further
+    field of ``kind``. The attribute ``t`` is the last of ``times``.
     """
 
     kind: type[Any]
@@ -115,8 +116,9 @@ class Stream:
     Rows are in order of arrival. A late row has an older timestamp than the row before. ``t`` (N,): times from the
     start of the log by the clock of the sensor [s]. ``source``: the name of the sensor if there are several of its
     kind, else "". ``rank``: of measurements with equal timestamps, those of a stream with a lower rank are processed
-    first. ``joins``: True if consecutive rows may be joined to one :class:`~factorgraph_loc.model.measurement.Rows`.
-    ``kind``: the class of a measurement, which is constructed from a timestamp and the columns.
+    first. ``joins``: True if estimators may process several rows in one
+    :class:`~factorgraph_loc.model.measurement.Rows` object. ``kind``: the class of a measurement. Its arguments are the
+    timestamp and the columns.
     """
 
     rank: ClassVar[int] = EXTEROCEPTIVE
@@ -130,8 +132,8 @@ class Stream:
         return map(self._made, (self.t + offset).tolist(), *(np.asarray(column).tolist() for column in self._columns()))
 
     def rows(self, offset: float) -> Rows:
-        """Return all rows joined to one measurement. The stream must have ``joins``. ``offset`` [s] is added to the
-        timestamps."""
+        """Return all N rows as one :class:`Rows` object of N measurements. ``offset`` [s] is added to the timestamps.
+        Call this only for streams with ``joins``, such as odometry."""
         return Rows(self.kind, self.t + offset, tuple(np.array(column, dtype=float) for column in self._columns()))
 
     @property
@@ -144,12 +146,12 @@ class Stream:
         return (column for name, column in columns_of(self).items() if name != "t")
 
     def without_first_motion(self) -> Self:
-        """Return the stream with zero motion in its first row. Use it if the robot was carried before that row. Streams
-        that do not measure motion are returned unchanged."""
+        """Return the stream with a motion of zero in its first row. Use it if the robot was carried before that row. A
+        stream that does not measure motion is returned unchanged."""
         return self
 
     def scans(self) -> Iterator[tuple[int, int]]:
-        """Yield for each sequence of rows with equal timestamps the index of its first row and of the row after it."""
+        """Yield (begin, end) for each sequence of rows with equal timestamps: the indices of its rows, end excluded."""
         return pairwise([*np.flatnonzero(np.diff(self.t, prepend=np.nan) != 0.0).tolist(), len(self.t)])
 
 
@@ -171,8 +173,8 @@ S = TypeVar("S", bound=Stream)
 
 
 def of_sensor(stream: Stream, name: str) -> Stream:
-    """Return the stream with the sensor's ``name`` as its ``source``. A stream is returned unchanged if the name has no
-    dot, as for the only sensor of its kind."""
+    """Return the stream with ``name``, the name of its sensor, in the field ``source``. A name without a dot belongs to
+    the only sensor of its kind. The stream is then returned unchanged."""
     return stream if kind_of(name) == name else replace(stream, source=name)
 
 

@@ -70,8 +70,9 @@ class Mounting(FileModel):
 
 
 class Turned(FileModel):
-    """The orientation of recorded poses or measurements. ``axes``: their axes. ``mounting``: the orientation of their
-    frame on the robot."""
+    """The orientation of recorded poses or measurements. ``axes``: the recorded axes that point forward, left and up,
+    such as "z -x -y". None means "x y z". ``mounting``: the orientation on the robot of the frame that these directions
+    define."""
 
     axes: Axes | None = None
     """recorded axes that point forward, left and up: body (x, y, z), optical (z, -x, -y), or such a list"""
@@ -160,12 +161,12 @@ def rotations_of(source: str | Path, rows: Integers, quaternions: Array) -> Arra
 def on_floor(
     source: object, positions: Array, rotations: Array | None, warnings: list[Notice], turned: Turned = AS_IT_IS
 ) -> Array:
-    """Return planar poses (N, 3) of ``positions`` (N, 3) [m] and ``rotations`` (N, 3, 3). The heading is that of the x
-    axis.
+    """Return planar poses (N, 3): x, y [m] and heading [rad], the horizontal direction of the x axis.
 
-    ``turned``: the axes of the recorded poses, and how their frame is mounted on the robot. If ``rotations`` is None,
-    headings are 0. A warning about the file ``source`` is appended to ``warnings`` if heights or tilts are too large.
-    Raises InputError if heights differ by more than :data:`MOST` and no axes are set, because y and z may be swapped.
+    ``positions`` (N, 3) [m], ``rotations`` (N, 3, 3): the recorded poses. If ``rotations`` is None, headings are 0.
+    ``turned``: the axes of the recorded poses, and how their frame is mounted on the robot. A warning about the file
+    ``source`` is appended to ``warnings`` if heights or tilts are too large. Raises InputError if heights differ by
+    more than :data:`MOST` and no axes are set, because y and z may be swapped.
     """
     places = positions @ turned.standing().T
     poses = np.column_stack((places[:, :2], np.zeros(len(places))))

@@ -78,7 +78,8 @@ class Exchange:
 
 
 def numbers(table: pl.DataFrame, names: Iterable[str]) -> Array:
-    """Return the K columns ``names`` of a table as an array (N, K). Raises InputError if an entry is not a number."""
+    """Return the K columns ``names`` of a table with N rows as an array (N, K). Raises InputError if an entry is not a
+    number."""
     import polars as pl  # noqa: PLC0415
 
     columns = []
@@ -139,7 +140,7 @@ class PosePath(Exchange):
         return np.array([t / 10**9 for t in self.stamps().tolist()])
 
     def rows(self, which: Integers) -> PosePath:
-        """Return a path with only the poses with the indices ``which``."""
+        """Return a path of the poses with the indices ``which`` (M,), in this order."""
         t_ns = None if self.t_ns is None else self.t_ns[which]
         return replace(self, positions=self.positions[which], rotations=self.rotations[which], t_ns=t_ns)
 

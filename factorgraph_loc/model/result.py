@@ -89,13 +89,12 @@ class RunResult:
         return float(self.config.get("max_gap", MAX_GAP))
 
     def first_localized(self) -> int | None:
-        """Return the index of the first estimate during the run with status ``localized``. Returns None if there is
-        none."""
+        """Return the index of the first causal estimate with the status ``localized``, or None if there is none."""
         localized = np.flatnonzero(np.array(self.status) == "localized")
         return int(localized[0]) if len(localized) else None
 
     def causal(self) -> Trajectory | None:
-        """Return the estimates during the run from the first localized one on. Returns None if no estimate is
+        """Return the causal estimates from the first localized one on as a trajectory. Return None if none is
         localized."""
         first = self.first_localized()
         if first is None:

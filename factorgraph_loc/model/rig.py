@@ -55,7 +55,8 @@ class Rig(FileModel):
         return super().model_copy(update=changed, deep=deep)
 
     def section(self, name: str) -> Any:
-        """Return the settings in a section, or of one of several sensors (``bearing_range.front``). None if missing."""
+        """Return the settings of the section or sensor ``name``, such as ``bearing_range.front``. None if it is
+        missing."""
         return by_name(kind_of(name), getattr(self, kind_of(name), None)).get(name)
 
     def names(self, section: str) -> tuple[str, ...]:
@@ -91,8 +92,8 @@ class Rig(FileModel):
         return settings
 
     def estimated(self, section: str) -> Estimated:
-        """Return the calibration constants of a sensor that are estimated. The result is empty if the rig lacks the
-        sensor. ``section``: the sensor's section in the rig."""
+        """Return the calibration constants of a sensor that are estimated, none if the rig lacks the sensor.
+        ``section``: the name of the sensor's section in the rig, such as ``odometry``."""
         settings = self.section(section)
         return settings.estimated() if isinstance(settings, SensorSettings) else NOTHING
 

@@ -129,7 +129,8 @@ class Ticks:
         return self._start + self._next / RATE
 
     def advance(self, t: float) -> Iterable[float]:
-        """Return the new ticks [s] before the next measurement, at time ``t`` [s]."""
+        """Return the ticks [s] before ``t`` that were not returned earlier. ``t`` [s]: the time of the next
+        measurement."""
         if self._newest <= t <= self._start + self._next / RATE and t <= self._newest + self.gap:
             self._newest = t
             return ()  # the most frequent case, which must be fast
@@ -149,7 +150,7 @@ class Ticks:
             yield tick
 
     def rest(self) -> Iterator[float]:
-        """Yield the remaining ticks up to the newest measurement."""
+        """Yield the remaining ticks [s] up to the newest measurement. Call this after the last measurement."""
         last = math.floor((self._newest - self._start) * RATE + TOLERANCE)
         while self._next <= last:
             tick = self._start + self._next / RATE

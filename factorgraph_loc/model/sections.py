@@ -66,8 +66,8 @@ def registered() -> Mapping[str, Any]:
 
 
 def sections() -> dict[str, Section]:
-    """Return the sections of a rig by name, in the order of a rig file. Those of sensors without measurements are
-    last."""
+    """Return {name: section} of the sections that a rig may have, in the order of a rig file. Sections of sensors
+    without measurements are last."""
     by_name = {name: section for sensor in registered().values() for name, section in sensor.settings.items()}
     used = set(sections_of_channels().values())
     return {name: by_name[name] for name in sorted(by_name, key=lambda name: name not in used)}

@@ -82,8 +82,8 @@ class Estimated:
         return Estimated(tuple(names[i] for i in indices), indices, sigmas[list(indices)])
 
     def full(self, values: Array, count: int) -> Array:
-        """Return an array (..., count) of all constants of the sensor: ``values`` (..., P) of the estimated ones, zeros
-        for the rest."""
+        """Return corrections (..., count) of all ``count`` constants of the sensor. They are ``values`` (..., P) for
+        the P estimated constants, and zero for the rest."""
         out = np.zeros((*np.shape(values)[:-1], count))
         out[..., list(self.indices)] = values
         return out
@@ -108,9 +108,7 @@ class SensorSettings(FileModel):
 
     def map_error(self, world: World) -> Callable[[Array], Array] | None:
         """Return a function from poses (N, 3) to covariances (N, 3, 3) of the map's error, None if the map is exact.
-
-        At each pose, the map around it may be displaced and rotated by an error (x, y, heading) with this covariance.
-        """
+        The error (x, y, heading) displaces and rotates the part of the map near a pose. ``world``: the map."""
         return None
 
     def placed(self, folder: Path) -> Self:

@@ -22,8 +22,8 @@ from factors.se2 import Array
 
 @dataclass(frozen=True)
 class Setup:
-    """The common arguments of all estimators. ``rig``: the robot. ``world``: the map. ``sensors``: the names of the
-    sensors to use. ``rng``: a random generator."""
+    """The common arguments of all estimators. ``rig``: the robot with the settings of its sensors. ``world``: the map.
+    ``sensors``: the names of the sensors to use. ``rng``: a random generator."""
 
     rig: Rig
     world: World
@@ -31,8 +31,8 @@ class Setup:
     rng: np.random.Generator
 
     def alone(self, sensor: str) -> Setup:
-        """Return these arguments with ``sensor`` as the only sensor of its kind, see
-        :meth:`~factorgraph_loc.model.rig.Rig.alone`."""
+        """Return these arguments with ``sensor`` as the only sensor of its kind, renamed to the kind. For example
+        ``bearing_range.front`` becomes ``bearing_range``."""
         return replace(self, rig=self.rig.alone(sensor), sensors=tuple(as_only(self.sensors, sensor)))
 
 
@@ -43,18 +43,19 @@ Calibration = Literal["all", "particles", "none"]
 
 @dataclass(frozen=True)
 class MapFrame:
-    """Accounts for the error of a map's position in the world. Its covariance is added to priors and to estimates.
-
-    ``error``: a function from poses (N, 3) to covariances (N, 3, 3) of the error (x, y, heading), or None.
-    """
+    """The error of a map's position and heading in the world. Methods add its covariance to priors and estimates.
+    ``error``: a function from poses (N, 3) to covariances (N, 3, 3) of this error (x, y, heading) at the poses. None
+    means that the map has no error."""
 
     error: Callable[[Array], Array] | None = None
 
     @classmethod
     def of(cls, setup: Setup, modalities: Container[str], landmarks: MapUse) -> MapFrame:
-        """Return the map error of a run, from the settings of its sensors.
+        """Return the map error of a run, from the settings of the first used sensor that define one.
 
-        ``modalities``: the kinds of sensors that the estimator uses. ``landmarks``: how the estimator uses the map.
+        ``setup``: has the settings and names of the sensors, and the map. ``modalities``: the kinds of sensors that the
+        estimator uses. ``landmarks``: "known", "extended" (landmarks are added to the map) or "unknown". There is no
+        map error if it is "unknown".
         """
         for name in setup.sensors if landmarks != "unknown" else ():
             settings = setup.rig.section(name) if kind_of(name) in modalities else None
@@ -64,28 +65,28 @@ class MapFrame:
         return cls()
 
     def prior(self, prior: PosePrior) -> PosePrior:
-        """Return a prior in the world frame converted to the map frame: the covariance of the map error is added."""
+        """Return the prior with the covariance of the map error at its pose added. The pose does not change."""
         if self.error is None:
             return prior
         return replace(prior, covariance=prior.covariance + self.error(prior.pose[None])[0])
 
     def estimate(self, estimate: PoseEstimate) -> PoseEstimate:
-        """Return an estimate in the map frame converted to the world frame, by adding the covariance of the map
-        error."""
+        """Return the estimate with the covariance of the map error at its pose added. The pose does not change. An
+        estimate with the status "unlocalized" is returned unchanged."""
         if self.error is None or estimate.status == "unlocalized":
             return estimate
         return replace(estimate, covariance=estimate.covariance + self.error(estimate.pose[None])[0])
 
     def belief(self, belief: Belief) -> Belief:
-        """Return a belief with the map error's covariance added to its modes. Limitation: the particles do not
-        change."""
+        """Return the belief with the covariance of the map error added to the covariance of each mode. The poses do not
+        change. Limitation: the particles are not changed, so they lack the error of the map."""
         if self.error is None:
             return belief
         modes = (replace(m, covariance=m.covariance + self.error(m.pose[None])[0]) for m in belief.modes)
         return replace(belief, modes=tuple(modes))
 
     def trajectory(self, trajectory: Trajectory) -> Trajectory:
-        """Return a trajectory with the covariance of the map error added to its covariances."""
+        """Return the trajectory with the covariance of the map error added at each pose. The poses do not change."""
         if self.error is None or trajectory.covariances is None or not len(trajectory):
             return trajectory
         return replace(trajectory, covariances=trajectory.covariances + self.error(trajectory.poses))

@@ -148,8 +148,11 @@ def neighbours(stamps: Array, t: Array, max_gap: float) -> tuple[Integers, Integ
 
 
 def averaged(covariances: Array, first: Integers, last: Integers, fraction: Array) -> Array:
-    """Return ``covariances`` (N, D, D) interpolated linearly to (M, D, D). Other arguments are from
-    :func:`neighbours`."""
+    """Return ``covariances`` (N, D, D) interpolated linearly at M times, as an array (M, D, D).
+
+    ``first``, ``last`` (M,): indices of the covariances before and after each time. ``fraction`` (M,): 0 at the first
+    of them, 1 at the last.
+    """
     weight = fraction[:, None, None]
     return np.asarray((1.0 - weight) * covariances[first] + weight * covariances[last])
 
