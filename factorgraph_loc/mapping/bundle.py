@@ -40,7 +40,7 @@ class Bundle:
 
     ``model``: the camera's calibration, adjusted if that was requested. ``cameras``: the adjusted poses. ``tracks``:
     the observations without outliers. ``points`` (T, 3) [m]: the adjusted positions of their points. ``old`` (T,): the
-    index of each point in the input. ``errors`` (N, 2) [px]: the residuals, predicted minus measured.
+    index that each point had in the input. ``errors`` (N, 2) [px]: the residuals, predicted minus measured.
     ``camera_covariances`` (F, 6, 6): of perturbations in the cameras' own frames, rotation first. ``point_covariances``
     (T, 3, 3) [m^2]: of the points. Limitation: the uncertainty of the calibration is not included.
     """
@@ -69,9 +69,10 @@ def adjust(
     """Return the result of a bundle adjustment of points and camera poses, and optionally of the camera's calibration.
 
     ``cameras``, ``covariances`` (F, 6, 6): the prior poses and their covariances, in the cameras' own frames, rotation
-    first. ``tracks``: the observations. ``points`` (T, 3) [m]: the initial positions. ``focal``: True to estimate the
-    focal lengths too. ``lens``: True to estimate the focal lengths, the principal point and the distortion (Brown's
-    model) too. ``progress``: is called with the fraction done. Raises RuntimeError if the graph cannot be solved.
+    first. ``tracks``: the observations. ``points`` (T, 3) [m]: the initial positions. ``focal``: True to estimate also
+    the focal lengths. ``lens``: True to estimate also the focal lengths, the principal point and the distortion
+    (Brown's model). ``progress``: a function that is called with the completed fraction, 0 to 1. Raises RuntimeError if
+    the graph cannot be solved.
     """
     old = np.arange(len(points))
     fixed = gtsam.NonlinearFactorGraph()
@@ -96,8 +97,8 @@ def adjust(
 
 
 def agreeing(model: CameraModel, cameras: Cameras, tracks: Tracks, points: Array, limit: float) -> Truths:
-    """Return a mask (N,) of the observations with a residual of at most ``limit`` standard deviations. If a point has
-    only one such observation, the mask is False for it, because one observation does not determine a point."""
+    """Return a mask (N,) of the inliers: observations with a residual of at most ``limit`` standard deviations. The
+    only inlier of a point is also excluded, because one observation does not determine a point."""
     errors, _, _, depths = reproject(model, cameras, points, tracks)
     right = (np.sum(errors**2, axis=1) < (limit * model.sigma) ** 2) & (depths > NEAREST)
     count = np.bincount(tracks.track[right], minlength=tracks.count)
@@ -108,7 +109,8 @@ def marginals(
     model: CameraModel, cameras: Cameras, information: Array, tracks: Tracks, points: Array
 ) -> tuple[Array, Array]:
     """Return the marginal covariances of the cameras (F, 6, 6) and of the points (T, 3, 3), linearised at ``cameras``
-    and ``points``. ``information`` (F, 6, 6): the inverse covariances of the cameras' prior poses."""
+    and ``points``. ``tracks``: the observations. ``information`` (F, 6, 6): the inverse covariances of the cameras'
+    prior poses."""
     count, total = len(cameras), tracks.count
     _, by_camera, by_point, _ = reproject(model, cameras, points, tracks)
     by_camera, by_point = by_camera / model.sigma, by_point / model.sigma
@@ -199,7 +201,7 @@ def _optimized(
 
 def _sparse(blocks: Array, rows: Integers, columns: Integers, shape: tuple[int, int]) -> Any:
     """Return a sparse block matrix of ``shape``. ``blocks`` (N, r, c): its blocks. ``rows``, ``columns`` (N,): their
-    block rows and block columns. Blocks at the same place are added."""
+    block rows and block columns. Blocks with the same row and column are added."""
     _, height, width = blocks.shape
     i = np.broadcast_to(height * rows[:, None, None] + np.arange(height)[:, None], blocks.shape)
     j = np.broadcast_to(width * columns[:, None, None] + np.arange(width), blocks.shape)

@@ -22,10 +22,10 @@ LABEL = 4  # last characters of a tag's EPC that are shown
 
 
 def tag_figure(log: str, made: MadeTags) -> Figure:
-    """Return a plot of a new map of tags, with the given map and the trajectory.
+    """Return a plot of a new map of tags, the map of the log (the given map), and the trajectory.
 
-    The plot also has the candidate positions of ambiguous tags, and the given tags that were not located. Labels are
-    the last characters of EPCs. ``log``: the name of the log. ``made``: the new map.
+    It also shows the candidate positions of ambiguous tags, and the given tags that were not located. Labels are the
+    last characters of EPCs. ``log``: the name of the log. ``made``: the new map.
     """
     out = figure(log, made.made, made.poses, LABEL)
     axis = out.axes[0]
@@ -67,10 +67,10 @@ def dropped_figure(
 
 
 def figure(log: str, made: LandmarkMap, poses: Array, label: int = 0) -> Figure:
-    """Return a plot of a new map of landmarks with 2-sigma ellipses, the given map and the trajectory.
+    """Return a plot of a new map of landmarks with 2-sigma ellipses, the given map (of the log), and the trajectory.
 
-    ``log``: the name of the log. ``made``: the new map. ``poses`` (N, 3): the trajectory in its frame. ``label``:
-    landmarks are labelled with this many last characters of their name, or with the whole name if it is 0.
+    ``log``: the name of the log. ``made``: the new map. ``poses`` (N, 3): the trajectory in the frame of the new map.
+    ``label``: the number of last characters of a landmark's name to show, or 0 for the whole name.
     """
     # other given positions are in another frame than the new map
     drawn = [e for e in made.entries if made.judged or e.verdict == "given"]

@@ -50,10 +50,10 @@ CONVERGED = 1e-9  # m and rad
 
 @dataclass(frozen=True)
 class Entry:
-    """One landmark in the comparison of a new map with a given map.
+    """One landmark in the comparison of a new map with the map of the log (the given map).
 
-    ``landmark``: its name. ``given``: its position (2,) in the given map, or None. ``learnt``: its position estimated
-    by the run, in the frame of the new map, or None. ``verdict``: the result of the comparison, such as "agrees".
+    ``landmark``: its name. ``given``: its position (2,) in the given map, or None. ``learnt``: its estimated position
+    with covariance, in the frame of the new map, or None. ``verdict``: the result of the comparison, such as "agrees".
     ``flagged``: True if the given position is wrong.
     """
 
@@ -78,11 +78,11 @@ class Entry:
 
 @dataclass(frozen=True)
 class LandmarkMap:
-    """A new map of landmarks, and its comparison with the given map.
+    """A new map of landmarks, and its comparison with the map of the log (the given map).
 
     ``world``: the new map. ``entries``: one per landmark that is in either map. ``frame`` (3,): the pose of the run's
-    frame in the frame of the new map. ``judged``: True if the new map was compared with the given map. Both maps then
-    have the same frame. ``notes``: messages for the user.
+    frame in the frame of the new map. ``judged``: True if the two maps were compared. They then have the same frame.
+    ``notes``: messages for the user.
     """
 
     world: World
@@ -102,7 +102,7 @@ class LandmarkMap:
         return tuple(entry.landmark for entry in self.entries if entry.flagged)
 
     def summary(self, what: str = "landmarks") -> str:
-        """Return a summary of the map in one sentence, with ``what``, the plural noun for the mapped objects."""
+        """Return a sentence that summarises the map. ``what``: the plural noun for the mapped objects."""
         counts = Counter("flagged" if entry.flagged else entry.verdict for entry in self.entries)
         text = f"{len(self.world.landmarks)} {what} are in the new map"
         parts = [f"{counts[verdict]} {VERDICTS[verdict]}" for verdict in VERDICTS if counts[verdict]]
@@ -115,9 +115,9 @@ class LandmarkMap:
 class Alignment:
     """The alignment of a new map with a given map.
 
-    ``pose`` (3,): x, y and angle of the transform from the new map's frame to the given map's frame. ``covariance`` (3,
-    3): of this transform. ``inliers``: the number of landmarks that agree. ``factor``: multiply the covariances of the
-    new landmarks by this correction.
+    ``pose`` (3,): x, y and angle of the transform from the new map's frame to the given map's frame. ``covariance``
+    (3, 3): of this transform. ``inliers``: the number of landmarks that agree. ``factor``: a correction by which the
+    covariances of the new landmarks must be multiplied.
     """
 
     pose: Array
@@ -132,15 +132,15 @@ IN_FRAME = Alignment(np.zeros(3), np.zeros((3, 3)), 0, 1.0)
 def make_map(
     log: Log, learnt: Mapping[str, LearntPoint], *, extend: bool = False, in_frame: bool = False
 ) -> LandmarkMap:
-    """Return a map of the ``learnt`` landmarks, which a run on ``log`` estimated, with a comparison.
+    """Return a map of the ``learnt`` landmarks, which a run on ``log`` estimated, and compare it with the log's map.
 
-    ``extend``: True if the run used the log's map and estimated only landmarks that the map lacks. The given landmarks
-    then stay unchanged. False if the run used no map. The estimated landmarks are then aligned and compared with the
-    log's map, if there is one. ``in_frame``: True if the estimated landmarks are in the frame of the log's map already.
+    ``extend``: True if the run used the log's map and estimated only landmarks that the map lacks. The landmarks of the
+    log's map then stay unchanged. False if the run used no map. The estimated landmarks are then aligned and compared
+    with the log's map, if there is one. ``in_frame``: True if the estimates are in the frame of the log's map already.
 
-    A given landmark is wrong if two conditions are met. Its distance from the estimated landmark is more than
-    ``TOLERANCE``. The squared Mahalanobis distance exceeds ``GATE``, with the sum of the covariances of estimated
-    landmark, alignment and given landmark. Raises RunFailedError if nothing was estimated.
+    The position of a landmark in the log's map is wrong if two conditions are met. Its distance from the estimate
+    exceeds ``TOLERANCE``. The squared Mahalanobis distance exceeds ``GATE``, with the covariances of both positions and
+    of the alignment. Raises RunFailedError if nothing was estimated.
     """
     if not learnt and not extend:
         raise RunFailedError(
@@ -173,17 +173,16 @@ def make_map(
 
 
 def align_robustly(points: list[LearntPoint], targets: Array, surveys: Array) -> Alignment:
-    """Return the alignment of K estimated landmarks with their given positions. It is robust to wrong given positions.
-
-    ``points``: the estimates. ``targets`` (K, 2), ``surveys`` (K, 2, 2): the given positions and their covariances. K
-    must be at least ``MIN_COMMON``.
-    """
+    """Return the robust alignment of K estimated landmarks with their given positions. A minority of wrong given
+    positions does not affect it. ``points``: the estimates. ``targets`` (K, 2), ``surveys`` (K, 2, 2): the given
+    positions and their covariances. K must be at least ``MIN_COMMON``."""
     positions = np.array([p.position for p in points])
     covariances = np.array([p.covariance for p in points])
     count = len(points)
 
     def errors(pose: Array) -> tuple[Array, Array, Array]:
-        """Return errors (K, 2), the inverses (K, 2, 2) of their covariances, and squared Mahalanobis distances (K,)."""
+        """Return the errors (K, 2) of the landmarks at the alignment ``pose`` (3,). Also return the inverses (K, 2, 2)
+        of their covariances, and their squared Mahalanobis distances (K,)."""
         turn = _rotation(pose)
         information = np.linalg.inv(turn @ covariances @ turn.T + surveys)
         error = se2.transform_from(pose, positions) - targets
@@ -195,7 +194,8 @@ def align_robustly(points: list[LearntPoint], targets: Array, surveys: Array) ->
     factor = float(np.clip(median / MEDIAN * (1.0 + 5.0 / (count - 2)) ** 2, *FACTORS))
 
     def cost(pose: Array) -> float:
-        """Return the sum of truncated squared errors of an alignment. Errors below ``TOLERANCE`` are not truncated."""
+        """Return the sum of squared errors of the alignment ``pose`` (3,). Large errors are truncated, but only those
+        above ``TOLERANCE``."""
         error, _, squared = errors(pose)
         tolerated = GATE * np.sum(error**2, axis=1) / TOLERANCE**2
         return float(np.minimum(np.minimum(squared / factor, tolerated), GATE).sum())
@@ -217,7 +217,7 @@ def align_robustly(points: list[LearntPoint], targets: Array, surveys: Array) ->
 
 
 def _pairs(count: int) -> list[list[int]]:
-    """Return all pairs of indices below ``count``, or ``MAX_PAIRS`` random pairs if there are more."""
+    """Return all pairs of different indices below ``count``, or ``MAX_PAIRS`` random pairs if there are more."""
     if count * (count - 1) // 2 <= MAX_PAIRS:
         return [list(pair) for pair in combinations(range(count), 2)]
     rng = np.random.default_rng(0)
@@ -225,7 +225,8 @@ def _pairs(count: int) -> list[list[int]]:
 
 
 def _moved(point: LearntPoint, alignment: Alignment) -> LearntPoint:
-    """Return an estimated point in the frame of the given map, with the covariance of the ``alignment`` added."""
+    """Return an estimated point, transformed to the frame of the given map. Its covariance includes the covariance of
+    the ``alignment``."""
     turn = _rotation(alignment.pose)
     (jacobian,) = _by_alignment(alignment.pose, point.position[None])
     covariance = alignment.factor * turn @ point.covariance @ turn.T + jacobian @ alignment.covariance @ jacobian.T
@@ -268,7 +269,7 @@ def _verdict(name: str, learnt: Mapping[str, LearntPoint], given: Mapping[str, L
 
 def _unjudged(log: Log, learnt: Mapping[str, LearntPoint], note: Notice) -> LandmarkMap:
     """Return a map of ``learnt`` landmarks in the frame of the run's start, without a comparison. ``note``: the reason
-    for this."""
+    why there is no comparison."""
     notes = [note, *not_located(log, learnt)]
     return _assemble(log, learnt, np.zeros(3), dict.fromkeys(log.world.landmarks, "not judged"), notes=notes)
 
@@ -284,11 +285,12 @@ def _assemble(
     judged: bool = False,
     notes: Sequence[Notice] = (),
 ) -> LandmarkMap:
-    """Return the new map: first the landmarks of the given map in their order, then the new ones.
+    """Return the new map: first the landmarks of the log's map in their order, then the new ones by name.
 
     ``learnt``: estimates by name, in the frame of the new map. ``frame`` (3,): the pose of the run's frame in the new
     map's frame. ``verdicts``: the result of each landmark's comparison by name, "new" if missing. ``keep``: names of
-    the landmarks that keep their given position. ``flagged``, ``judged``, ``notes``: see :class:`LandmarkMap`.
+    the landmarks that keep their position in the log's map. ``flagged``: names of the landmarks with a wrong position
+    in it. ``judged``: True if the maps were compared. ``notes``: messages for the user.
     """
     entries, landmarks = [], {}
     sensors = [log.rig.of(BearingRangeSettings, name) for name in log.rig.names("bearing_range")]

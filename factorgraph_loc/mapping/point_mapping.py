@@ -96,7 +96,7 @@ class PointReport:
     and ``observations`` of these points. ``rms``, ``mad`` [px]: root mean square and median absolute value of the
     residuals. ``parallax`` [rad], ``sigma`` [m]: medians over points of the parallax and of the standard deviation in
     the worst direction. ``shifted`` [m], ``turned`` [rad]: median corrections of the camera poses. ``focal`` [px]: the
-    focal length fx. ``fused``: the number of points that the extended map contained already.
+    focal length fx. ``fused``: the number of points that were already in an older map, if the new map extends one.
     """
 
     keyframes: int
@@ -134,9 +134,10 @@ def map_points(
 ) -> MadePoints:
     """Return a map of points, triangulated from images with known camera poses (``posed``).
 
-    ``progress``: is called with the fraction done. Raises RunFailedError if no point is observed from several
-    positions, if the adjustment fails, or if no point meets the settings. Raises InputError if the settings require a
-    new calibration, and the camera has another distortion than Brown's.
+    ``model``: the calibration of the camera. ``settings``: None means the defaults. ``progress``: a function that is
+    called with the completed fraction, 0 to 1. Raises RunFailedError if no point is observed from several positions, if
+    the adjustment fails, or if no point meets the settings. Raises InputError if the settings require a new
+    calibration, and the camera has another distortion model than Brown's.
     """
     settings = settings or PointSettings()
     posed = posed[chosen_keyframes(posed, settings)]
@@ -175,7 +176,7 @@ def map_points(
 
 
 def chosen_keyframes(posed: PosedFrames, settings: PointSettings) -> Integers:
-    """Return the indices of the images that become keyframes. They differ by at least ``settings.distance`` or
+    """Return the indices of the images that become keyframes. Any two of them differ by ``settings.distance`` or
     ``settings.angle``. Both limits are increased until there are at most :data:`MOST_KEYFRAMES`."""
     filled = np.flatnonzero([len(frame.pixels) > 0 for frame in posed.frames])
     distance, angle = settings.distance, settings.angle
@@ -187,7 +188,8 @@ def chosen_keyframes(posed: PosedFrames, settings: PointSettings) -> Integers:
 
 
 def epipolar_gate(model: CameraModel, covariances: Array) -> float:
-    """Return the largest distance [px] of a match from its epipolar line. ``covariances`` (F, 6, 6): of cameras."""
+    """Return the largest distance [px] of a correct match from its epipolar line. ``covariances`` (F, 6, 6): of the
+    camera poses, in the cameras' own frames, rotation first."""
     turn, shift = (np.median(np.trace(covariances[:, i : i + 3, i : i + 3], axis1=1, axis2=2)) / 3.0 for i in (0, 3))
     sigma = np.sqrt(2.0 * (model.sigma**2 + model.fx**2 * (turn + shift / DEPTH**2)))
     return float(np.clip(GATE * sigma, NARROW, WIDE))
@@ -196,10 +198,10 @@ def epipolar_gate(model: CameraModel, covariances: Array) -> float:
 def point_map(
     posed: PosedFrames, cameras: Cameras, tracks: Tracks, points: Array, covariances: Array, views: int
 ) -> PointMap:
-    """Return a map of T points. Each point has the descriptors of at most ``views`` observations.
+    """Return a map of T points. Each point has the descriptors of at most ``views`` of its observations.
 
     ``posed``: the images. ``points`` (T, 3), ``covariances`` (T, 3, 3): positions and their covariances. ``cameras``:
-    camera poses. ``tracks``: the observations of the points.
+    the camera poses, one per image. ``tracks``: the observations of the points.
     """
     shown = _different_views(cameras, tracks, points, views)
     views_of = list(zip(tracks.frame[shown].tolist(), tracks.feature[shown].tolist(), strict=True))
@@ -245,8 +247,8 @@ def _made(
 
 
 def _kept(adjusted: Bundle, settings: PointSettings) -> tuple[Tracks, Array, Array, Array]:
-    """Return the points that meet ``settings``: tracks, positions (T, 3), covariances (T, 3, 3) and parallaxes (T,)
-    [rad]."""
+    """Return the points that meet ``settings``: their tracks, positions (T, 3), covariances (T, 3, 3) and parallaxes
+    (T,) [rad]. Raises RunFailedError if no point meets them."""
     tracks, points, covariances = adjusted.tracks, adjusted.points, adjusted.point_covariances
     angles = parallax(adjusted.cameras, points, tracks)
     good = (
@@ -290,9 +292,10 @@ def _different_views(cameras: Cameras, tracks: Tracks, points: Array, views: int
 def posed_frames(log: Log, turn_sigma: float = 0.01, shift_sigma: float = 0.02) -> PosedFrames:
     """Return the images of a log with camera poses from the log's reference trajectory.
 
-    Images before or after the reference or in its gaps are left out. ``turn_sigma`` [rad], ``shift_sigma`` [m]:
-    standard deviations of the camera poses about and along each axis, used if the reference has no covariances. Raises
-    InputError if the log has no camera, no features or no reference with headings, or if no image remains.
+    Images before or after the reference, or in its gaps, are left out. ``turn_sigma`` [rad], ``shift_sigma`` [m]:
+    standard deviations of rotation and position of each camera, per axis. They are used if the reference has no
+    covariances. Raises InputError if the log has no camera, no features or no reference with headings, or if no image
+    remains.
     """
     t, all_frames = frames_of(log)
     if log.rig.find(CameraSettings) is None:

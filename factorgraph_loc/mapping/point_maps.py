@@ -28,12 +28,12 @@ LEAST = 1e-6  # m: standard deviation that is added to all points, so that exact
 
 
 def merged(first: PointMap, second: PointMap) -> tuple[PointMap, int]:
-    """Return two maps merged to one, and the number of points that both maps have in common.
+    """Return the merged map of two maps, and the number of points that both maps have in common.
 
     Common points are recognised by the descriptors of their views, and keep their names in ``first``. The other points
     of ``second`` with views get new names. Points without views keep their names. Raises InputError if the maps have
-    features of different kinds. Also raises it if a point of ``second`` without views has the name of a point of
-    ``first``.
+    features of different kinds. Also raises InputError if a point of ``second`` without views has the name of a point
+    of ``first``.
     """
     kinds = {points.feature for points in (first, second) if points.feature}
     if len(kinds) > 1:
@@ -79,9 +79,11 @@ def thinned(points: PointMap, most: int) -> PointMap:
 
 
 def _joined(first: PointMap, second: PointMap, added: Integers, owners: Integers) -> PointMap:
-    """Return a map with the points of ``first``, the points ``added`` (indices) of ``second``, and the views of both.
+    """Return a map with all points of ``first``, the points of ``second`` with the indices ``added``, and the views of
+    both.
 
-    ``owners`` (P,): for each point of ``second``, the index of the point in the result that gets its views.
+    ``owners`` (P,): the index in the returned map of each of the P points of ``second``. Its views are assigned to this
+    point.
     """
     named = {second.names[i] for i in np.setdiff1d(added, second.owners).tolist()}
     if double := sorted(named & set(first.names)):
@@ -109,8 +111,8 @@ def _joined(first: PointMap, second: PointMap, added: Integers, owners: Integers
 
 
 def _common(first: PointMap, second: PointMap) -> Array | None:
-    """Return the field ``common`` (V, 3, 3) of the joined map: the values of ``first``, then the values of ``second``.
-    The values are zero where a map lacks this field. Returns None if both maps lack it."""
+    """Return the field ``common`` (V, 3, 3) of the joined map, the covariances of shared errors. They are those of
+    ``first``, then those of ``second``, zero for a map without this field. Returns None if both maps lack it."""
     if first.common is None and second.common is None:
         return None
     return np.concatenate([np.zeros((len(p.owners), 3, 3)) if p.common is None else p.common for p in (first, second)])

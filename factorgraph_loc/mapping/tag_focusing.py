@@ -66,8 +66,8 @@ def focused(
 
 
 def _focused(model: PhaseModel, reads: PhaseReads, height: float, prior: LearntPoint) -> LearntPoint:
-    """Return an improved position of one tag at ``height`` [m]. ``prior``: its position before. ``reads``: the reads of
-    this tag, with antenna poses in the world frame."""
+    """Return an improved position of one tag at ``height`` [m]. ``prior``: its initial position with covariance.
+    ``reads``: the reads of this tag with phase, and the antenna poses in the world frame."""
     information = np.asarray(np.linalg.inv(prior.covariance), dtype=np.float64)
     position = prior
     for _ in range(SELECTIONS):
@@ -84,7 +84,8 @@ def _focused(model: PhaseModel, reads: PhaseReads, height: float, prior: LearntP
 
 
 def _lattice(covariance: Array) -> Array:
-    """Return a lattice of displacements (G, 2) [m] within ``REACH`` standard deviations of zero. The first is zero."""
+    """Return a lattice of displacements (G, 2) [m] within ``REACH`` standard deviations of zero. The first is zero.
+    ``covariance`` (2, 2) [m^2]: of the position."""
     extent = np.minimum(REACH * np.sqrt(np.diag(covariance)), FARTHEST)
     axes = [np.arange(-e, e + STEP, STEP) for e in extent]
     cells = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -94,10 +95,8 @@ def _lattice(covariance: Array) -> Array:
 
 def _best(likelihood: PhaseLikelihood, reads: PhaseReads, start: Array, information: Array, offs: Array) -> Array:
     """Return the displacement (2,) of a tag, among ``offs`` (G, 2), that has the largest posterior density.
-
-    ``start`` (2,): the position before the displacement, relative to the mean of the prior. ``information`` (2, 2): the
-    inverse covariance of the prior.
-    """
+    ``likelihood``: of the phases of ``reads``, for the tag at ``start``. ``start`` (2,): the position before the
+    displacement, relative to the mean of the prior. ``information`` (2, 2): the inverse covariance of the prior."""
     poses = np.column_stack((-offs, np.zeros(len(offs))))
     moved = offs + start
     cost = 0.5 * np.einsum("gi,ij,gj->g", moved, information, moved) - likelihood.log_likelihood(poses, reads)
@@ -108,7 +107,8 @@ def _refined(
     likelihood: PhaseLikelihood, reads: PhaseReads, start: Array, information: Array, off: Array
 ) -> tuple[Array, Array]:
     """Return the displacement (2,) of a tag with the largest posterior density, and its information matrix (2, 2).
-    Fisher scoring starts at the displacement ``off`` (2,). ``start``, ``information``: see :func:`_best`."""
+    Fisher scoring starts at the displacement ``off`` (2,). ``start`` (2,): the position before the displacement,
+    relative to the mean of the prior. ``information`` (2, 2): the inverse covariance of the prior."""
 
     def at(off: Array) -> tuple[float, Array, Array]:
         score, moved = likelihood.score(np.array((*-off, 0.0)), reads), off + start

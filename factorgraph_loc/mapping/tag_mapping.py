@@ -34,12 +34,12 @@ Poses = Literal["reference", "odometry"]
 
 @dataclass(frozen=True)
 class MadeTags:
-    """A new map of tags, and its comparison with the given map.
+    """A new map of tags, and its comparison with the map of the log.
 
     ``world``: the map as written to a file, in the survey frame (rig section ``[survey]``). ``made``: the same tags as
-    landmarks in the world frame, compared with the given tags. ``poses`` (N, 3): the trajectory in the world frame.
-    ``open``: the reason why a tag was not located, by EPC. ``modes``: candidate positions of ambiguous tags in the
-    world frame, by EPC.
+    landmarks in the world frame, with the comparison. ``poses`` (N, 3): the trajectory in the world frame. ``open``:
+    the reason why a tag was not located, by EPC. ``modes``: candidate positions of ambiguous tags in the world frame,
+    by EPC.
     """
 
     world: World
@@ -67,10 +67,10 @@ def map_tags(
     """Return a map of the tags that a log read.
 
     ``poses``: "reference" uses the poses of the log's reference, "odometry" estimates poses and tags together.
-    ``prior``: the start pose, which defines the frame of estimated poses. If it is None, the first pose is the origin,
-    and the directions of tags in the log's map are not used. ``extend``: True keeps the tags of the log's map and uses
-    them to estimate the poses. False estimates all tags, and compares them with the log's map. ``height`` [m]: of tags
-    that the map lacks; None uses the mean height of the antennas. ``progress``: is called with the fraction done.
+    ``prior``: the start pose for "odometry". If it is None, the first pose is the origin, and the directions of tags in
+    the log's map are not used. ``extend``: True keeps the tags of the log's map and uses them to estimate the poses.
+    False estimates all tags, and compares them with the log's map. ``height`` [m]: of tags that the map lacks; None
+    uses the mean height of the antennas. ``progress``: a function that is called with the completed fraction, 0 to 1.
 
     Raises InputError if the log has no reads, no antennas in its rig or no suitable reference. Raises RunFailedError if
     no tag could be located.
@@ -118,11 +118,9 @@ def map_tags(
 def _along_reference(
     log: Log, observations: TagObservations
 ) -> tuple[dict[int, LearntPoint], Array, list[TagPosterior], Array]:
-    """Return the positions, by index, of those of T tags that can be located along the log's reference.
-
-    Also returns the directions (T,) [rad] of all tags' fronts and the search results of all tags. The last value is the
-    robot poses (K, 3) at the antenna observations.
-    """
+    """Return (positions, directions, posteriors, poses) of T tags. ``positions``: of the located tags, by index.
+    ``directions`` (T,) [rad]: of the tags' fronts, NaN if unknown. ``posteriors``: the search results of all tags.
+    ``poses`` (K, 3): the robot poses, by the log's reference, at the antenna observations."""
     if log.reference is None:
         raise InputError(f"{log.name}: has no reference: map its tags with --poses odometry")
     if not log.reference.has_heading:

@@ -83,8 +83,8 @@ class TagPosterior:
     """The result of the search for the position of one tag.
 
     ``modes``: by descending weight; the weights sum to 1. ``reads``: the number of inventory rounds that read the tag.
-    ``gain``: the log-likelihood ratio of the best position to a position out of reach of all antennas. It is multiplied
-    by an exponent below 1, because reads are correlated.
+    ``gain``: the log-likelihood ratio of the best position to a position out of reach of all antennas. The ratio is
+    reduced by a factor below 1, because reads are correlated.
     """
 
     modes: tuple[TagMode, ...]
@@ -110,8 +110,9 @@ class TagPosterior:
 def search(model: RfidModel, counts: TagReadCounts, heights: Array, facing: Array) -> list[TagPosterior]:
     """Return one search result for the position of each of T tags.
 
-    ``counts``: the reads of these tags, with the robot poses in the world frame as ``offsets``. ``heights`` (T,) [m]:
-    of the tags. ``facing`` (T,) [rad]: the directions of the tags' fronts, NaN if unknown.
+    ``model``: the model of the RFID reader. ``counts``: the reads of these tags, with the robot poses in the world
+    frame as ``offsets``. ``heights`` (T,) [m]: of the tags. ``facing`` (T,) [rad]: the directions of the tags' fronts,
+    NaN if unknown.
     """
     counts = merged(counts, *FINE)
     uses_facing = any(m.uses_facing for m in model.models)
@@ -139,8 +140,8 @@ def search(model: RfidModel, counts: TagReadCounts, heights: Array, facing: Arra
 
 
 def merged(counts: TagReadCounts, distance: float, angle: float) -> TagReadCounts:
-    """Return read counts, summed over consecutive counts of an antenna while the robot is within ``distance`` [m] and
-    ``angle`` [rad]."""
+    """Return the read ``counts`` with consecutive counts of an antenna summed. They are summed while the robot stays
+    within ``distance`` [m] and ``angle`` [rad] of its pose at the first of them."""
     group = np.empty(len(counts.antennas), dtype=np.int64)
     first: dict[int, int] = {}
     kept: list[int] = []
@@ -164,8 +165,9 @@ def merged(counts: TagReadCounts, distance: float, angle: float) -> TagReadCount
 def _lattice_search(
     model: RfidModel, counts: TagReadCounts, read: NDArray[np.bool_], heights: Array, facing: Array
 ) -> TagCandidates:
-    """Return the best candidates on a lattice of positions where an antenna can read a tag. ``read`` (T,): mask of the
-    tags to search. The other arguments are those of :func:`search`."""
+    """Return the best candidates on a lattice of positions where an antenna can read a tag. ``counts``: the reads of T
+    tags, with robot poses in the world frame. ``read`` (T,): mask of the tags to search. ``heights`` (T,) [m],
+    ``facing`` (T,) [rad]: height of each tag, and direction of its front, NaN if unknown."""
     cells = _cells(counts.offsets[:, :2], reach(model))
     uses_facing = any(m.uses_facing for m in model.models)
     free = np.arange(DIRECTIONS) * (2.0 * np.pi / DIRECTIONS) if uses_facing else np.array([np.nan])
@@ -203,10 +205,11 @@ def _cells(places: Array, distance: float) -> Array:
 def _nll(
     model: RfidModel, counts: TagReadCounts, tags: NDArray[np.int64], cells: Array, height: float, direction: float
 ) -> Array:
-    """Return the negative log-likelihood (G, S) of S ``tags`` at the lattice points ``cells`` (G, 2). It is multiplied
-    by an exponent below 1, because reads are correlated.
+    """Return the negative log-likelihood (G, S) of the reads of S ``tags`` (indices) at the lattice points ``cells``
+    (G, 2). It is multiplied by an exponent below 1, because reads are correlated.
 
-    ``height`` [m]: height of the tags. ``direction`` [rad]: direction of their fronts.
+    ``counts``: the reads of all tags. ``height`` [m]: height of the tags. ``direction`` [rad]: direction of their
+    fronts.
     """
     points = np.column_stack((cells, np.full(len(cells), height)))
     likelihood = RfidLikelihood(model, TagArray(points, np.full(len(cells), direction)))
@@ -313,11 +316,9 @@ def reach(model: RfidModel) -> float:
 def refine(
     model: RfidModel, counts: TagReadCounts, heights: Array, candidates: TagCandidates
 ) -> tuple[TagCandidates, Array, Array]:
-    """Return C candidates, moved to the nearest local optimum of the likelihood. ``counts``, ``heights``: see
-    :func:`search`.
-
-    Also returns their negative log-likelihoods (C,) and covariances (C, 2, 2).
-    """
+    """Return C ``candidates``, each moved to the nearest local optimum of the likelihood. Also return their negative
+    log-likelihoods (C,) and position covariances (C, 2, 2). ``counts``: the reads of T tags, with robot poses in the
+    world frame. ``heights`` (T,) [m]: of the tags."""
     places, nll = candidates.places.copy(), np.empty(len(candidates.tag))
     covariances = np.empty((len(nll), 2, 2))
     prior = np.eye(2) / reach(model) ** 2
@@ -333,12 +334,12 @@ def refine(
 def _refined(
     model: RfidModel, counts: TagReadCounts, heights: Array, facing: Array, places: Array
 ) -> tuple[Array, Array, Array]:
-    """Return positions (C, 2) of C candidates, moved to the nearest local optimum. Column c of ``counts.hits`` has the
-    reads of candidate c.
+    """Return positions (C, 2) of C candidates, moved to the nearest local optimum. Also return their negative
+    log-likelihoods (C,) and information matrices (C, 2, 2).
 
-    ``heights``, ``facing`` (C,), ``places`` (C, 2): of the candidates. Also returns negative log-likelihoods (C,) and
-    information matrices (C, 2, 2). The information is the observed curvature if it is positive definite, otherwise the
-    Fisher information.
+    ``counts``: column c of ``hits`` has the reads of candidate c. ``heights``, ``facing`` (C,), ``places`` (C, 2): of
+    the candidates. The information is the observed curvature if it is positive definite, otherwise the Fisher
+    information.
     """
 
     def at(places: Array, which: Integers) -> tuple[Array, Array, Array]:

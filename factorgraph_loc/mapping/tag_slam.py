@@ -71,8 +71,8 @@ class TagObservations:
     has_height: NDArray[np.bool_]
 
     def along(self, poses: Array, which: NDArray[np.bool_] | slice = slice(None)) -> TagReadCounts:
-        """Return the read counts of L selected observations, with robot poses. ``which``: mask (K,) that selects them,
-        or a slice. ``poses`` (L, 3): the robot poses at the times of the selected observations, in the world frame."""
+        """Return the read counts of L selected observations, with robot poses. ``which``: a mask (K,) or a slice that
+        selects them. ``poses`` (L, 3): the robot poses at their times, in the world frame."""
         return TagReadCounts(poses, self.antennas[which], self.rounds[which], self.hits[which])
 
 
@@ -127,10 +127,9 @@ def tag_observations(log: Log, height: float | None = None) -> TagObservations:
 def _rows(
     m: RfidScan, antennas: dict[str, int], index: dict[str, int]
 ) -> list[tuple[float, int, int, NDArray[np.int64]]]:
-    """Return the antenna observations of a scan: time [s], index of the antenna, number of rounds, and reads (T,).
-
-    ``antennas``, ``index``: the indices of antennas and of T tags by name.
-    """
+    """Return (time [s], antenna, rounds, reads) per antenna that measured in the scan ``m``: the index of the antenna,
+    its number of rounds, and the number of rounds (T,) that read each tag. ``antennas``, ``index``: the indices of
+    antennas and of T tags by name."""
     places = [antennas.get(name, -1) for name in m.antennas]
     out = {a: (m.t, a, places.count(a), np.zeros(len(index), dtype=np.int64)) for a in sorted(set(places) - {-1})}
     # a tag counts once per round, even if it answers several times
@@ -210,17 +209,18 @@ class _Problem:
         self._count = 1
 
     def extend(self, count: int) -> None:
-        """Add keyframes until there are ``count``. Their poses are predicted by odometry."""
+        """Add keyframes until there are ``count`` in all. Their poses are predicted by odometry."""
         for i in range(self._count, count):
             step = self._recalibrated(self._steps[i - 1])
             self._values[pose_key(i)] = se2.compose(self._values[pose_key(i - 1)], step)
         self._count = max(self._count, count)
 
     def search(self, wanted: NDArray[np.bool_], first: int) -> list[TagPosterior]:
-        """Return a search result for each of T tags along the current poses. It is empty for tags that are not
+        """Return a search result for each of T tags along the current poses. The result has no modes if the tag is not
         searched.
 
-        ``wanted`` (T,): mask of the tags to search. ``first``: the first keyframe whose observations are used.
+        ``wanted`` (T,): mask of the tags to search. ``first``: the index of the first keyframe with observations that
+        are used.
         """
         which = self._used & (self._keyframe >= first) & (self._keyframe < self._count)
         poses = se2.compose(self._poses()[self._keyframe[which]], self._offsets[which])
@@ -237,7 +237,7 @@ class _Problem:
         return out
 
     def add_located(self, posteriors: list[TagPosterior]) -> bool:
-        """Add the tags located by the search results ``posteriors`` to the map, and move mapped tags if their new
+        """Add to the map the tags that ``posteriors`` (search results of all tags) locate. Move a mapped tag if its new
         position differs significantly. Returns True if the map changed."""
         changed = False
         for tag, posterior in enumerate(posteriors):

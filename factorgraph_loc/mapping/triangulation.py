@@ -71,7 +71,7 @@ class Tracks:
 
     def kept(self, mask: Truths) -> tuple[Tracks, Integers]:
         """Return only the observations for which ``mask`` (N,) is True. Points without an observation are removed, and
-        the rest get consecutive numbers. Also returns the old number of each remaining point."""
+        the indices of the other points become consecutive. Also returns the old index of each remaining point."""
         old, track = np.unique(self.track[mask], return_inverse=True)
         left = (self.frame[mask], self.feature[mask], self.pixels[mask])
         return Tracks(track.astype(np.int64), *left), old
@@ -93,8 +93,9 @@ class Triangulated:
     parallax: Array
 
     def good(self, tracks: Tracks, model: CameraModel, parallax: float = PARALLAX) -> Truths:
-        """Return a mask (T,) of the points that are reliable. They have two or more observations, an allowed depth in
-        all cameras, small residuals, and a parallax of at least ``parallax`` [rad]."""
+        """Return a mask (T,) of the reliable points. These have two or more observations, an allowed depth in all
+        cameras, small residuals, and a parallax of at least ``parallax`` [rad]. ``tracks``: the observations.
+        ``model``: the camera."""
         invalid = (self.depths < NEAREST) | (self.depths > FARTHEST)
         square = np.bincount(tracks.track, np.sum(self.errors**2, axis=1), minlength=tracks.count)
         rms = np.sqrt(square / np.maximum(tracks.lengths(), 1))
@@ -116,11 +117,8 @@ def reproject(model: CameraModel, cameras: Cameras, points: Array, tracks: Track
 
 
 def triangulate(model: CameraModel, cameras: Cameras, tracks: Tracks) -> Triangulated:
-    """Return the points of ``tracks``, triangulated for exact camera poses by
-    :mod:`factors.camera.triangulation_kernels`.
-
-    The parallax of a point is set to 0 if its rays do not determine it.
-    """
+    """Return the points of ``tracks``, triangulated for exact camera poses. The parallax of a point is set to 0 if its
+    rays do not determine it."""
     points, covariances = np.zeros((tracks.count, 3)), np.zeros((tracks.count, 3, 3))
     rays, determined = reprojection.rays(model, tracks.pixels), np.zeros(tracks.count, dtype=bool)
     rays /= np.linalg.norm(rays, axis=1)[:, None]
@@ -162,8 +160,8 @@ def keyframes(cameras: Cameras, distance: float, angle: float) -> Integers:
 
 
 def overlapping_pairs(cameras: Cameras) -> list[tuple[int, int]]:
-    """Return pairs (i, j), i < j, of images that probably overlap. Each image is paired with the nearest ones, and with
-    some that are farther away."""
+    """Return pairs (i, j), i < j, of images that probably show the same objects. Each image is paired with the nearest
+    ones by pose, and with some that are farther away."""
     pairs = set()
     for i in range(len(cameras)):
         distance = np.linalg.norm(cameras.positions - cameras.positions[i], axis=1)
@@ -203,9 +201,9 @@ def matched_pairs(
 ) -> list[tuple[int, int, Integers, Array]]:
     """Return the matching features of each of the ``pairs`` (i, j) of images. Pairs without a match are left out.
 
-    ``gate`` [px]: see :func:`near_epipolar_lines`. The result for a pair is i, j, the indices (K, 2) of matching
-    features, and the distances (K,) of their descriptors. Distances are divided by their median over the pair of
-    images.
+    ``gate`` [px]: the largest distance of a match from its epipolar line. The result for a pair is i, j, the indices
+    (K, 2) of matching features, and the distances (K,) of their descriptors. Each distance is divided by the median
+    distance of this pair of images.
     """
     out = []
     for i, j in pairs:
@@ -220,10 +218,11 @@ def matched_pairs(
 
 
 def chained(frames: Sequence[CameraFrame], matches: Sequence[tuple[int, int, Integers, Array]]) -> Tracks:
-    """Return matches joined to tracks. A track is a set of features of different images that show the same point.
+    """Return tracks made from ``matches``, which are the result of :func:`matched_pairs`. A track is a set of features
+    of different images that show the same point.
 
-    Matches are joined in order of descriptor distance. A match that would join two features of one image is omitted.
-    ``matches``: the result of :func:`matched_pairs`.
+    Matches are processed in order of descriptor distance. A match that would add two features of one image to a track
+    is omitted.
     """
     starts = np.cumsum([0, *(len(frame.pixels) for frame in frames)])
     frame_of = np.repeat(np.arange(len(frames)), np.diff(starts))
@@ -264,6 +263,7 @@ def chained(frames: Sequence[CameraFrame], matches: Sequence[tuple[int, int, Int
 
 
 def angles_between(first: Array, second: Array) -> Array:
-    """Return the angles (F,) [rad] between two sets of rotations. Each is (F, 3, 3), or a single rotation (3, 3)."""
+    """Return the angles (F,) [rad] between two sets of rotations. ``first``, ``second``: each (F, 3, 3), or one
+    rotation (3, 3)."""
     trace = np.einsum("nij,nij->n", *np.broadcast_arrays(first, second))
     return np.asarray(np.arccos(np.clip((trace - 1.0) / 2.0, -1.0, 1.0)))
