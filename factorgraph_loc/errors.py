@@ -46,10 +46,10 @@ def require(
     values: NDArray[Any],
     expected: str,
 ) -> None:
-    """Raise the error of :func:`bad_field` at the first of the ``values`` (N, ...) that is invalid, if any.
+    """Raise InputError at the first of the ``values`` (N, ...) that is invalid, if any.
 
     ``valid`` (N,): a mask of the valid values. ``rows`` (N,): line numbers of the values in ``file``. ``field``: the
-    name of the values. ``expected``: a description of valid values.
+    name of the values. ``expected``: a description of valid values. The message is that of :func:`bad_field`.
     """
     if not valid.all():
         i = int(valid.argmin())

@@ -79,9 +79,13 @@ def build_map(
 ) -> maps.MadeMap:
     """Estimate a map of landmarks, RFID tags or points from a log, and return it.
 
-    Writes ``out`` (``NAME.world.toml``) and a picture next to it. ``rig``, ``world``: replace those of the log.
-    ``progress`` is called with the fraction of the work that is done. For the other arguments see
-    :class:`~factorgraph_loc.experiments.maps.MapOptions`.
+    Writes ``out`` (``NAME.world.toml``) and a picture next to it. ``of``: landmarks, tags or points, by default what
+    the log measures. ``estimator``, ``settings``: the estimator of landmarks, and changes of its settings. ``extend``:
+    keep the log's map and add missing objects. ``poses``: the robot poses for a map of tags: "reference", or "odometry"
+    to estimate them too. ``height`` [m]: height of new tags or landmarks, by default that of the antennas or the radio.
+    ``prior``: the start pose, "X,Y,HEADING" or a name such as "reference". ``drop_dead``: only remove tags from the
+    log's map that the log shows to be dead. ``points``: settings of a map of points. ``rig``, ``world``: replace those
+    of the log. ``progress`` is called with the fraction of the work that is done.
     """
     maps.plot_path(Path(out), overwrite=overwrite)
     options = maps.MapOptions(of, estimator, settings or {}, extend, poses, height, prior, drop_dead, points or {})

@@ -65,10 +65,9 @@ def convert(
     world: WorldLike | None = None,
     overwrite: bool = False,
 ) -> None:
-    """Write a log as the folder ``out`` in the native format of this project.
+    """Write a log as the folder ``out`` in the native format of this project. ``format``: the file type of the tables.
 
-    ``format``: of the tables. ``rig``, ``world``: replace those of the log. ``overwrite``: replace a log in the folder
-    ``out``.
+    ``rig``, ``world``: replace those of the log. ``overwrite``: replace a log in the folder ``out``.
     """
     write_native(read_log(log, rig=rig, world=world), out, format, overwrite=overwrite)
 

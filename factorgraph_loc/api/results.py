@@ -172,12 +172,15 @@ def score(
     out: str | Path | None = None,
     overwrite: bool = False,
 ) -> TrajectoryScore:
-    """Score a trajectory against another. The field ``figures`` of the returned score has the errors, in metres and radians.
+    """Return the errors of a trajectory against another, in the field ``figures`` in metres and radians.
 
     ``estimate``, ``reference``: trajectories with times of the same clock, or texts that name trajectories as in
-    ``fgloc score``. ``out``: a folder for the files of ``fgloc score``. For the other arguments see
-    :func:`~factorgraph_loc.evaluation.trajectories.score.score_paths`. Raises InputError if a trajectory cannot be
-    read, or if no poses of the two can be paired.
+    ``fgloc score``. ``align``: how the estimate is first moved onto the reference: "none", "origin" (first poses
+    agree), "se2", "yaw", "se3" or "sim3". ``associate``: how poses are paired: "nearest" in time, at most ``max_diff``
+    [s] apart, or "interpolate" across gaps of at most ``max_gap`` [s]. ``all_pairs``: compute relative errors from each
+    pose, not over successive segments. ``align_poses``: number of first poses that determine the alignment, by default
+    all. ``delta``: further lengths of relative errors, such as "5m" or "2s". ``out``: a folder for the files of ``fgloc
+    score``. Raises InputError if a trajectory cannot be read, or if no poses can be paired.
     """
     if out is not None:
         require_free(Path(out), FILES, overwrite=overwrite)

@@ -66,7 +66,8 @@ def run(
     estimate the constants of the rig from the log itself. Only the final trajectory uses these estimates. ``align``:
     unless it is "none", there are also scores after this alignment with the reference trajectory. ``out``: a folder for
     the files of ``fgloc run``. ``progress`` is called with the fraction of the work that is done. ``rig``, ``world``:
-    replace those of the log. For ``max_gap`` and ``tick_gap`` see :class:`~factorgraph_loc.model.scoring.RunConfig`.
+    replace those of the log. ``max_gap`` [s]: longest gap between estimates that scoring interpolates. ``tick_gap``
+    [s]: no estimates are recorded in longer gaps between measurements.
     """
     if out is not None:
         require_free(Path(out), FILES, overwrite=overwrite)

@@ -63,7 +63,7 @@ def calibrate(
 
 @dataclass(frozen=True)
 class MapArguments:
-    """The options of ``fgloc map`` that are arguments of :func:`factorgraph_loc.api.learning.build_map`, except the settings."""
+    """The options of ``fgloc map`` that :func:`factorgraph_loc.api.learning.build_map` has too, except the settings."""
 
     estimator: Annotated[
         str,
@@ -228,9 +228,9 @@ def _rows(made: LandmarkMap, verdicts: Mapping[str, str]) -> list[tuple[str, ...
 
 
 def _entries(made: LandmarkMap, verdicts: Mapping[str, str]) -> dict[str, dict[str, Any]]:
-    """Return by name, for each landmark or tag, its given and estimated position, their distance, and a verdict.
+    """Return {name: values} of the landmarks or tags in a new map, such as the given and the estimated position.
 
-    ``verdicts``: for some names, texts that replace the verdict in ``made``."""
+    "verdict" is the result of comparing the two positions. ``verdicts``: for some names, texts that replace it."""
     return {
         entry.landmark: {
             "given": None if entry.given is None else entry.given.tolist(),

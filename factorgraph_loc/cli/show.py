@@ -37,7 +37,7 @@ def note(text: str) -> None:
 
 
 def warnings(doubts: Sequence[object]) -> None:
-    """Print the first :data:`WARNINGS` of the warnings ``doubts`` on stderr, one per line, and the number of more."""
+    """Print the first :data:`WARNINGS` of the warnings ``doubts`` on stderr, one per line, and how many are not printed."""
     for doubt in doubts[:WARNINGS]:
         note(f"warning: {one_line(str(doubt))}")
     if len(doubts) > WARNINGS:

@@ -58,10 +58,10 @@ def render(template: str, **values: Any) -> str:
 
 
 def sectioned(title: str, lead: str, doubts: Sequence[Notice], sections: Mapping[str, Sequence[Part]]) -> str:
-    """Return an HTML page with a heading for each section.
+    """Return an HTML page with a heading for each section. ``lead``: the introduction. ``doubts``: highlighted
+    warnings.
 
-    ``lead``: the introduction. ``doubts``: warnings, which are highlighted. ``sections``: by heading, the parts of a
-    section, each a paragraph, a table or a picture.
+    ``sections``: {heading: parts}. A part is a paragraph, a table or a picture.
     """
     names = {f"section-{i}": name for i, name in enumerate(sections)}
     parts = dict(zip(names, sections.values(), strict=True))

@@ -150,7 +150,7 @@ def _path(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colour
 
 
 def _trail(recording: rr.RecordingStream, at: str, trajectory: Trajectory, colour: Colour) -> None:
-    """Draw the path up to the current time, as segments that appear at their times. A gap has no segment.
+    """Draw the path up to the displayed time, as segments that appear when the robot drives there. Gaps are not drawn.
 
     ``at``: the entity path in Rerun."""
     positions = trajectory.poses[:, :2]
@@ -225,10 +225,9 @@ def _pixels_over_time(
 
 
 def _predicted_pixels(model: reprojection.CameraModel, pose: Array, points: Array) -> Array:
-    """Return the pixels (K, 2) of at most :data:`NEAREST` visible ``points`` (P, 3), sorted by distance from the
-    camera.
+    """Return the pixels (K, 2) of at most :data:`NEAREST` visible ``points`` (P, 3), nearest to the camera first.
 
-    ``pose`` (3,): x, y, heading of the robot. K is 0 if it is NaN."""
+    ``pose`` (3,): x, y, heading of the robot. If it is NaN, no pixels are returned (K = 0)."""
     if not np.isfinite(pose).all():
         return np.empty((0, 2))
     pixels, depths = reprojection.predict(model, pose, points)
@@ -239,7 +238,7 @@ def _predicted_pixels(model: reprojection.CameraModel, pose: Array, points: Arra
 def _camera_and_robot(log: Log, runs: Sequence[StoredRun]) -> tuple[str, Trajectory | None]:
     """Return the entity path of the camera in Rerun, and the trajectory of the robot that carries the camera, or None.
 
-    It is the trajectory of the first run that has one, or else the reference of the log."""
+    The trajectory is that of the first run that has one, or else the reference of the log."""
     for run in runs:
         if len(run.played()):
             return f"{WORLD}/{run.name}/robot/camera", run.played()

@@ -167,7 +167,7 @@ class _Maker:
         return self.message(start_ns, topic, "nav_msgs/Path", header=self.header(start_ns, MAP), poses=poses)
 
     def markers(self, t_ns: int, topic: str, shapes: Sequence[Mapping[str, Any]]) -> Message:
-        """Return (time [ns], topic, type, MarkerArray). ``shapes``: the values of :meth:`shape` and :meth:`dots`."""
+        """Return (time [ns], topic, type, MarkerArray). ``shapes``: the fields of each marker, see :meth:`shape`."""
         empty = {
             "header": self.header(t_ns, MAP),
             "action": 0,  # ADD

@@ -35,7 +35,7 @@ class Cells:
     ``units``: the unit of a field in the file: a name, or the factor that converts values to ``Column.unit``.
     ``decimal``: the decimal mark. ``left_out``: names of the columns of the file that are not read.
     ``passed``: number of JSON objects without a needed column. ``unwanted``: number of rows that ``where`` excludes.
-    ``rules``: whether invalid rows are skipped and late rows sorted. None: both are errors.
+    ``rules``: whether invalid rows are skipped, and rows sorted by time. None: invalid rows and decreasing times are errors.
     ``unread``: row number and error message of each row that could not be split into cells.
     ``resumed`` (N,): True for each row that follows a skipped row.
     """
@@ -96,7 +96,7 @@ class Cells:
 
         ``columns``: the description of each field, the timestamps first. ``offset`` [s]: is added to the timestamps.
         ``more``: invalid cells that the caller has found in addition. If rows are skipped or sorted, a warning is
-        appended to ``warnings``. Raises InputError at an invalid or late row unless ``rules`` allow that.
+        appended to ``warnings``. Raises InputError at an invalid row or decreasing time, unless ``rules`` allow it.
         """
         rules = self.rules
         if rules is None or rules.refuse:
@@ -155,7 +155,7 @@ class Cells:
         return *faults, self.fault(name, away, f"a time at most {MAX_SPAN / 86_400.0:g} days from most of the file")
 
     def _known(self, stamps: tuple[Integers, Sequence[Fault]]) -> Integers:
-        """Return the timestamps ``stamps[0]`` [ns]. Raises InputError if ``stamps[1]`` contains a fault."""
+        """Return the timestamps ``stamps[0]`` [ns]. Raises InputError at the first invalid cell in ``stamps[1]``."""
         self.require(stamps[1])
         return stamps[0]
 

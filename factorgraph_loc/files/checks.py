@@ -96,9 +96,9 @@ def arrivals(
 ) -> None:
     """Check that no timestamp in ``t_ns`` (N,) [ns] is older than a previous one by more than ``max_late_ns`` [ns].
 
-    If a timestamp is late by less, a warning is appended to ``warnings``. ``max_late_ns`` None: any delay is valid.
-    ``rows`` (N,): row numbers in the file ``source``. ``rules``: if given, errors name the key that sorts the rows.
-    Raises InputError for a larger delay.
+    If a timestamp is older by a shorter time, a warning is appended to ``warnings``. ``max_late_ns`` None: any order is
+    valid. ``rows`` (N,): row numbers in ``source``. ``rules``: if given, errors name the key that sorts the rows.
+    Raises InputError if the check fails.
     """
     newest = np.maximum.accumulate(t_ns) if len(t_ns) else t_ns
     late = newest - t_ns

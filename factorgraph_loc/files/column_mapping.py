@@ -60,7 +60,7 @@ class ColumnMapping(FileModel):
     """which rows to read: by column of the file, the value or the list of possible values"""
 
     def chosen(self) -> dict[str, set[str]]:
-        """Return the setting ``where`` as texts: for each column, the values that rows to read may have in it."""
+        """Return the setting ``where`` as {column: texts}. A row is read if each of these columns has one of its texts."""
         return {
             column: {_text(value) for value in (values if isinstance(values, tuple) else (values,))}
             for column, values in self.where.items()
@@ -164,8 +164,8 @@ class TableFolder:
     def record_read(
         self, cells: Cells, mapping: TimedMapping, columns: Mapping[str, Column], more: Sequence[Fault] = ()
     ) -> Cells:
-        """Record that the rows and columns of ``cells`` are read. Return the valid cells, by time if ``mapping`` sorts
-        rows.
+        """Record that the rows and columns of ``cells`` are read. Return the valid cells, sorted by time if ``mapping``
+        says so.
 
         ``columns``: the description of each field. ``more``: invalid cells that the caller has found in addition.
         """
@@ -220,9 +220,9 @@ def text_of_hex(digits: str) -> str:
 
 
 def _read_csv(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]) -> Cells:
-    """Return the columns of a CSV file that ``mapping`` assigns to fields, in the rows that ``where`` selects.
+    """Return the columns of a CSV file that ``mapping`` assigns to fields, in the rows that its ``where`` selects.
 
-    Raises InputError if all columns of one entry of ``needed`` are missing."""
+    ``needed``: groups of columns. Raises InputError if the file lacks all columns of a group."""
     numbered = [(row, line) for row, line in enumerate(read_text(path).splitlines(), start=1) if line.strip()]
     comments, content = split_comments(numbered)
     if not content:
@@ -287,14 +287,16 @@ def parsed(path: Path, lines: Sequence[tuple[int, str]], separator: str) -> Iter
 
 
 def _has(names: Collection[str], needed: Sequence[Alternatives]) -> bool:
-    """True if ``names`` has at least one column of each entry of ``needed``."""
+    """True if ``names`` has at least one column of each group of columns in ``needed``."""
     return all(any(column in names for column in columns) for columns in needed)
 
 
 def _require_columns(
     path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives], header: Sequence[str], row: int
 ) -> None:
-    """Raise InputError if a needed column is missing in ``header``, or a mapped one occurs twice. ``row``: its line."""
+    """Raise InputError if a needed column is missing in ``header``, or if ``header`` has a mapped column twice.
+
+    ``needed``: groups of columns; the file needs one column of each group. ``row``: line number of the header."""
     counts = Counter(header)
     for columns in [*needed, *((column,) for column in mapping.where)]:
         if not _has(counts, [columns]):
@@ -307,7 +309,8 @@ def _require_columns(
 def _read_json_lines(path: Path, mapping: ColumnMapping, needed: Sequence[Alternatives]) -> Cells:
     """Return the mapped columns of a file whose lines are JSON objects or lists of JSON objects.
 
-    Objects that ``where`` excludes or that lack a ``needed`` column are ignored. Raises InputError if all lack one."""
+    ``needed``: groups of columns. Objects that lack all columns of a group, or that ``where`` excludes, are ignored.
+    Raises InputError if no object has a column of a group."""
     unread: list[tuple[int, str]] = []
     objects = list(_objects(path, unread))
     where = mapping.chosen()

@@ -78,7 +78,9 @@ class Column:
 
     @cached_property
     def measured(self) -> Column:
-        """The column of an attribute of a ``Stream``. ``name`` is ``field``; ``low`` is at least ``left_out_below``."""
+        """The description of the same quantity as an attribute of a ``Stream``.
+
+        Its ``name`` is the name of the attribute. Its lower bound ``low`` is at least ``left_out_below``."""
         return replace(self, name=self.field or self.name, low=max(self.low, self.left_out_below))
 
     @property
@@ -173,7 +175,7 @@ class Table:
 
 
 def find_outlier(tables: Sequence[Array | Integers], most: float) -> tuple[int, int, float] | None:
-    """Return the timestamp that is farthest from the median: the index of its table, its row, and the median.
+    """Return the timestamp that is farthest from the median, as (index of its table, row in the table, median).
 
     ``tables``: arrays of timestamps. Returns None if no two timestamps differ by more than ``most``, in the same unit.
     """
@@ -216,19 +218,24 @@ def number(
     may_lack: bool = False,
     left_out_below: float = -math.inf,
 ) -> Column:
-    """Return a :class:`Column` of numbers. ``units``: by name, the factors that convert units to the first unit.
-    ``low``, ``high``: inclusive bounds. ``doc``: meaning. For the other arguments see the fields of :class:`Column`."""
+    """Return the :class:`Column` ``name`` of numbers. ``units``: {unit: factor that converts it to the first unit}.
+
+    ``low``, ``high``: inclusive bounds. ``doc``: its meaning. ``may_lack``: True if a cell may be empty. Values below
+    ``left_out_below`` are treated as empty cells."""
     return Column(name, "number", units, low, high, may_lack, doc, left_out_below=left_out_below)
 
 
 def within(name: str, units: Mapping[str, float], most: float, doc: str) -> Column:
-    """Return a :class:`Column` of numbers from ``-most`` to ``most``. ``units``: factors that convert a unit to the
-    first unit, by its name. ``doc``: meaning of the column."""
+    """Return the :class:`Column` ``name`` of numbers from ``-most`` to ``most``. ``doc``: its meaning.
+
+    ``units``: {unit: factor that converts it to the first unit}."""
     return number(name, units, -most, most, doc)
 
 
 def named(name: str, doc: str, kind: Literal["name", "file"] = "name", *, field: str = "") -> Column:
-    """Return a :class:`Column` of names or of paths of files. The arguments are the values of its fields."""
+    """Return the :class:`Column` ``name`` of names or of paths of files. ``doc``: its meaning.
+
+    ``field``: the attribute of a ``Stream`` with its values, by default ``name``."""
     return Column(name, kind, {}, 0.0, math.inf, False, doc, field)
 
 

@@ -91,8 +91,7 @@ def bounds(metadata: Sequence[Any]) -> tuple[float, float]:
 
 
 def _within(kind: type[BaseModel], name: str, value: Any) -> Any:
-    """Return ``value`` clipped to the bounds of the field ``name`` of the model ``kind``. NaN and values that are not
-    numbers are returned unchanged."""
+    """Return ``value`` clipped to the bounds of the field ``name`` of the model ``kind``. Texts and NaN are not changed."""
     field = kind.model_fields.get(name)
     if field is None or isinstance(value, bool) or not isinstance(value, (int, float)):
         return value

@@ -144,7 +144,7 @@ def _is_model(kind: Any) -> bool:
 
 
 def _own(key: str, parts: list[_Part], setting: Setting) -> Iterator[Setting]:
-    """Yield the description of the setting ``key``. A table is described only if it has a docstring.
+    """Yield the description of the setting ``key``. A table is described only if its field has a docstring.
 
     ``parts``: the alternatives of its type. ``setting``: a description with key, default and meaning, to complete."""
     own = [part for part in parts if not _is_model(part.type)]

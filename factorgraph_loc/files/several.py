@@ -13,9 +13,9 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 def one_or_several(kind: type[BaseModel]) -> Any:
-    """Return a type annotation for a field with the settings of one sensor, of several sensors by name, or None.
+    """Return a type annotation for a pydantic field: the settings of one sensor, {name: settings} of several, or None.
 
-    ``kind``: class of the settings. In TOML, a field ``gps`` is a table ``[gps]``, or tables ``[gps.NAME]``.
+    ``kind``: class of the settings of a sensor. In TOML, field ``gps`` is a table ``[gps]``, or tables ``[gps.NAME]``.
     """
     several = TypeAdapter(dict[str, kind])  # type: ignore[valid-type]
 
@@ -45,9 +45,10 @@ def is_name(name: str) -> bool:
 
 
 def by_name(section: str, value: Model | Mapping[str, Model] | None) -> dict[str, Model]:
-    """Return the settings in a field with the annotation :func:`one_or_several`, by their keys.
+    """Return the settings of one or several sensors of a kind as {section: settings}. Returns {} if ``value`` is None.
 
-    ``section``: name of the field. The key of a single sensor is ``section``; of several, ``section.NAME``.
+    ``value``: the settings of one sensor, or {name: settings} of several. ``section``: the section of one sensor, such
+    as "gps". The sections of several sensors are "gps.NAME".
     """
     if isinstance(value, Mapping):
         return {f"{section}.{name}": model for name, model in value.items()}

@@ -43,11 +43,10 @@ def csv_rows(path: Path, lines: Sequence[tuple[int, str]], **form: Any) -> Itera
 def rows_of_length(
     path: Path, header: Sequence[str], rows: Iterable[tuple[int, list[str]]], rules: RowRules | None = None
 ) -> tuple[Integers, dict[str, list[str]], tuple[tuple[int, str], ...]]:
-    """Return the rows of a CSV file by column. ``rows``: line number and cells of each row.
+    """Return the rows of a CSV file as (line numbers (N,), {name in ``header``: N cells}, rejected rows).
 
-    The results are the line numbers (N,), the N cells of each column by its name in ``header``, and the rejected rows.
-    A rejected row has a wrong number of cells, and is given as line number and error. Raises InputError at the first
-    such row unless ``rules`` skip it.
+    ``rows``: line number and cells of each row. A rejected row has a wrong number of cells, and is given as (line
+    number, error). Raises InputError at the first such row unless ``rules`` skip it.
     """
     numbers: list[int] = []
     table: list[list[str]] = []
@@ -65,10 +64,10 @@ def rows_of_length(
 
 
 def read_cells(path: Path, tables: Sequence[Table], rules: RowRules | None = None) -> tuple[Cells, tuple[Column, ...]]:
-    """Read a CSV file that contains one of several possible ``tables``.
+    """Return the cells of a CSV file that contains one of several possible ``tables``, and descriptions of its columns.
 
-    Returns the cells, and the descriptions of the columns of the table that fits the header of the file best. Raises
-    InputError if the content is invalid. ``rules``: whether invalid rows are skipped. None: they are errors.
+    The columns are those of the table that fits the header of the file best. ``rules``: whether invalid rows are
+    skipped. None: they are errors. Raises InputError if the content is invalid.
     """
     lines = list(enumerate(io.StringIO(read_text(path), newline=""), start=1))
     parsed = csv_rows(path, lines)
@@ -168,7 +167,7 @@ class TableRows:
     ``rows`` (N,): line numbers in the file ``path``, or row numbers from 1 in a Parquet file. ``t_ns`` (N,): timestamps
     [ns]. ``numbers``: numbers (N,) of each column in ``Column.unit``, NaN for empty cells. ``names``: N texts of each
     column of names. ``left_out``: columns of the file that are not read.
-    ``rules``: whether invalid rows are skipped and late rows sorted. None: both are errors.
+    ``rules``: whether invalid rows are skipped, and rows sorted by time. None: invalid rows and decreasing times are errors.
     ``resumed`` (N,): True for each row that follows a skipped row.
     """
 

@@ -114,8 +114,9 @@ class Localizer:
     def push(self, measurement: Measurement) -> None:
         """Process a measurement. Push measurements in order of arrival.
 
-        A late measurement is processed at its own time if it is late by at most the estimator's setting ``max_delay``. Otherwise it
-        is counted and dropped. Features of an image are detected in the calling thread while other measurements are processed.
+        A measurement may have an older timestamp than those before it. If it is older by at most ``max_delay``, a
+        setting of the estimator, it is processed at its own time. Otherwise it is counted and dropped. Features of an
+        image are detected in the calling thread while other measurements are processed.
 
         Raises InputError in these cases. The measurement is then dropped and nothing else changes.
 
@@ -145,10 +146,9 @@ class Localizer:
             return self._estimate(t)
 
     def belief(self) -> Belief:
-        """Return the distribution of the pose at the newest timestamp: Gaussian modes, and particles if the estimator
-        has them.
+        """Return the distribution of the pose at the newest timestamp: Gaussian modes, and particles if there are any.
 
-        Before the start it has no modes. Raises RunFailedError as :meth:`estimate` does.
+        Before the start it has no modes. Raises RunFailedError if the estimator has failed, or if a mode is not valid.
         """
         with self._lock:
             self._require_whole()
@@ -176,9 +176,10 @@ class Localizer:
                 return copy.deepcopy(self._estimator.learnt())
 
     def diagnostics(self) -> Diagnostics:
-        """Return the counts of ignored, rejected and late measurements since the start, and recent statistics.
+        """Return the counts of ignored, rejected and delayed measurements since the start, and recent statistics.
 
-        The statistics are residuals and normalised innovations by sensor, and events such as a rebuilt graph.
+        A delayed measurement has an older timestamp than a previous one. The statistics are residuals and normalised
+        innovations by sensor, and events such as a rebuilt graph.
         """
         with self._lock:
             return Diagnostics() if self._estimator is None else copy.deepcopy(self._estimator.diagnostics)
@@ -328,9 +329,10 @@ def usable_sensors(rig: Rig, asked: Sequence[str] | None) -> tuple[str, ...]:
 
 
 def prior_of(pose: ArrayLike, covariance: ArrayLike | None, t: float | None) -> PosePrior:
-    """Return the Gaussian prior of the start from the arguments of :meth:`Localizer.initialize`.
+    """Return the Gaussian prior of a start pose. ``pose`` (3,): x, y [m] and heading [rad], NaN for an unknown heading.
 
-    Its time is NaN if ``t`` is None. Raises InputError if an argument is invalid.
+    ``covariance``: (3, 3), or (2, 2) if the heading is unknown; None for the default. ``t``: time [s], stored as NaN if
+    None. Raises InputError if an argument is invalid.
     """
     mean = numbers("initialize()", "pose", pose)
     known = mean[: 2 if mean.shape == (3,) and np.isnan(mean[2]) else 3] if mean.shape == (3,) else mean
