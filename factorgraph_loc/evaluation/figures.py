@@ -94,20 +94,23 @@ def mark_events(axis: Axes, events: Sequence[tuple[float, str]]) -> None:
 
 
 def with_pauses(t: Array, values: Array) -> tuple[Array, Array]:
-    """Return times (N,) and values (N, ...) with a row of NaN in each long gap of ``t``, which ends a plotted line."""
+    """Return ``t`` (N,) [s] and ``values`` (N, ...) with a row of NaN inserted in each gap, to interrupt a plotted
+    line. A gap is an interval between timestamps above 1 s and above three times the median interval."""
     breaks = pauses(t)
     return np.insert(t, breaks, np.nan), np.insert(values, breaks, np.nan, axis=0)
 
 
 def gapped_path(trajectory: Trajectory) -> Array:
-    """Return the positions (M, 2) [m] of a trajectory, with a row of NaN in each long gap between timestamps."""
+    """Return the positions (M, 2) [m] of a trajectory, with a row of NaN in each long gap, which interrupts a plotted
+    line."""
     return with_pauses(trajectory.t, trajectory.poses[:, :2])[1]
 
 
 def consistency(log: Log, estimator: str, track: Track) -> Figure | None:
     """Return a figure of the NEES of the causal and final poses, and of the NIS per degree of freedom of each sensor.
 
-    The NEES is plotted only if the log has a reference. Returns None if there is neither NEES nor NIS.
+    ``estimator``: its name for the title. ``track``: the data of its run on the ``log``. The NEES is plotted only if
+    the log has a reference. Returns None if there is neither NEES nor NIS.
     """
     # innovations without any component have no degrees of freedom and are omitted
     innovations = {s: rows[(rows[:, 2] > 0.0) & np.isfinite(rows[:, 1])] for s, rows in track.nis.items()}

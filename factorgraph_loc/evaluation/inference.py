@@ -144,12 +144,13 @@ def contrast(
 
 
 def differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Return a table of the differences between the RMSEs of all pairs of estimators ``a`` and ``b`` on each log.
+    """Return rows with the differences between the RMSEs of estimators ``a`` and ``b``, for all pairs and logs.
 
     ``rows``: runs as dictionaries with log, estimator, seed and scores. A row of the result has the keys
-    :data:`DIFFERENCES`. ``value_a``, ``value_b``: RMSEs over pairs of seeds, None without pairs. ``difference``: a
-    minus b. ``pairs``: number of compared pairs of runs. ``left_out``: number of runs without a run of the other
-    estimator. If there are enough logs, a row with the log "(all)" has a 95 % interval ``low``, ``high``.
+    :data:`DIFFERENCES`. ``value_a``, ``value_b``: RMSEs over the seeds that both ran, None without such seeds.
+    ``difference``: ``value_a`` - ``value_b``. ``pairs``: number of compared pairs of runs. ``left_out``: number of runs
+    without a run of the other estimator. With enough logs, a row with the log "(all)" has a 95 % interval ``low``,
+    ``high``.
     """
     logs = list(dict.fromkeys(row["log"] for row in rows))
     names = list(dict.fromkeys(row["estimator"] for row in rows))
@@ -218,7 +219,7 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
 
 
 def least_p(count: int) -> float:
-    """Return the smallest p value that :func:`signed_rank` can return for ``count`` differences."""
+    """Return the smallest p value that the signed-rank test can have with ``count`` differences."""
     return float(2.0 ** (1 - count))
 
 

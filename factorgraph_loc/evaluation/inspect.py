@@ -44,8 +44,8 @@ class Inspection:
 
     @property
     def found(self) -> dict[str, Any]:
-        """The statistics of all sensors by key, such as ``unseen`` or ``rfid``. If the rig has several sensors of a
-        kind, the key is the name of a sensor. The value is then a dictionary of its statistics."""
+        """Statistics of the measurements as {key: value}, such as ``{"unseen": [...]}``, from all sensors. If the rig
+        has several sensors of a kind, their statistics are nested: {name of the sensor: {key: value}}."""
         entries: dict[str, Any] = {}
         for name, summary in self.sensors.items():
             entries |= summary.found if kind_of(name) == name else {name: dict(summary.found)}
@@ -58,7 +58,8 @@ class Inspection:
 
 
 def inspect(log: Log) -> Inspection:
-    """Return a summary of the streams and sensors of a log, with warnings about problems."""
+    """Return a summary of a log: its streams, its reference, the measurements of its sensors, and warnings about
+    problems."""
     streams = {name: _summary(stream.t) for name, stream in log.streams.items()}
     reference = None if log.reference is None else _summary(log.reference.t)
     problems = list(log.warnings)

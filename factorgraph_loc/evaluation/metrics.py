@@ -62,8 +62,8 @@ class Errors:
 def errors(trajectory: Trajectory, reference: Trajectory, max_gap: float = MAX_GAP) -> Errors:
     """Return the errors of a trajectory against the reference, without alignment.
 
-    The errors are at timestamps of the reference that are at least 0.1 s apart. ``max_gap`` [s]: errors are NaN between
-    estimates that are further apart. See :func:`~factorgraph_loc.evaluation.pairing.pairs`.
+    The errors are at timestamps of the reference that are at least 0.1 s apart, with estimates interpolated at them.
+    ``max_gap`` [s]: errors are NaN between estimates that are further apart.
     """
     if trajectory.covariances is not None:
         unsound = ~_positive_definite(trajectory.covariances)
@@ -106,14 +106,15 @@ def score(result: RunResult, log: Log, align: Alignment = "none") -> dict[str, A
       ``scored`` are None.
     - ``time_to_localized`` [s]: time from the start of the run until the robot is localized.
     - ``landmarks.*``: see :func:`landmark_figures`; None unless the run estimated the map.
-    - ``learnt.NAME.value`` and ``learnt.NAME.sigma``: value and standard deviation of each estimated constant
-      of a sensor.
-    - ``nis.SENSOR.*``, ``ignored.*``, ``rejected.*``, ``late.*``, ``timing.*``, and the list ``warnings`` always exist.
+    - ``learnt.NAME.value`` and ``learnt.NAME.sigma``: value and standard deviation of each estimated constant of a
+      sensor.
+    - ``nis.SENSOR.*``: statistics of innovations. ``ignored.*``, ``rejected.*``, ``late.*``: numbers of unused
+      detections. ``timing.*``: computing times. ``warnings``: a list of texts. They exist in every run.
 
     ``align``: how to align the trajectories with the reference. If the run estimated its map, "none" becomes "se2".
-    With an alignment there are also ``scoring.align``, and the errors :data:`ALIGNED` [m, rad] after the alignment, by
-    :func:`~factorgraph_loc.evaluation.trajectories.score.score_paths`. If the poses do not determine the alignment,
-    these errors are None and there is a warning.
+    With an alignment there are also ``scoring.align`` and the errors :data:`ALIGNED` [m, rad]. These are errors after
+    alignment by :func:`~factorgraph_loc.evaluation.trajectories.score.score_paths`. If the poses do not determine the
+    alignment, these errors are None and there is a warning.
     """
     causal = result.causal()
     final = result.final

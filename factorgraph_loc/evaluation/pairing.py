@@ -106,7 +106,8 @@ def rms(values: Array) -> float | None:
 
 
 def summarize(values: Array) -> dict[str, float | None]:
-    """Return the statistics :data:`HOW` of the finite values by name. They are None if there are no finite values."""
+    """Return the statistics of the finite ``values`` as {name: value}: rmse, mean, median, p95, max, min and std. All
+    are None if there are no finite values."""
     values = values[np.isfinite(values)]
     if not len(values):
         return dict.fromkeys(HOW)
@@ -122,10 +123,10 @@ def summarize(values: Array) -> dict[str, float | None]:
 
 
 def successive(steps: Array, length: float, first: int = 0) -> list[tuple[int, int]]:
-    """Return the first and the last pose of successive pieces of a path of N poses, as pairs of indices.
+    """Return (index of the first pose, index of the last pose) of successive sections of a path of N poses.
 
-    ``steps`` (N - 1,): distances or times between successive poses. A piece ends at the first pose where the sum of its
-    steps is ``length`` or more. ``first``: number that is added to all indices.
+    ``steps`` (N - 1,): distances or times between successive poses. A section ends at the first pose where the sum of
+    its steps is ``length`` or more. ``first``: an offset that is added to all indices.
     """
     pieces: list[tuple[int, int]] = []
     begin, covered = first, 0.0
@@ -138,10 +139,11 @@ def successive(steps: Array, length: float, first: int = 0) -> list[tuple[int, i
 
 
 def all_pairs(steps: Array, length: float, first: int = 0) -> list[tuple[int, int]]:
-    """Return the first and the last pose of overlapping pieces of a path of N poses, as pairs of indices.
+    """Return (index of the first pose, index of the last pose) of overlapping sections of a path of N poses.
 
-    A piece begins at each pose. Its length is as near to ``length`` as possible. A piece is omitted if its length
-    deviates by more than :data:`PIECE_TOLERANCE` times ``length``. ``steps``, ``first``: see :func:`successive`.
+    ``steps`` (N - 1,): distances or times between successive poses. A section begins at each pose, and the sum of its
+    steps is as near to ``length`` as possible. It is omitted if the sum deviates by more than :data:`PIECE_TOLERANCE`
+    times ``length``. ``first``: an offset that is added to all indices.
     """
     covered = np.concatenate(([0.0], np.cumsum(steps))).tolist()
     pieces: list[tuple[int, int]] = []

@@ -115,7 +115,8 @@ def overview(log: Log, odometry: Trajectory | None) -> Figure:
 def reliability_diagram(log: Log, estimator: str, reliability: Mapping[str, Reliability]) -> Figure:
     """Return a figure of the ratio of observed to predicted numbers of detections, with 2-sigma bars.
 
-    ``reliability``: by sensor, the numbers of detections in groups of measurements, such as ranges of distance.
+    ``log``, ``estimator``: for the title. ``reliability``: by sensor, the numbers of detections in groups of
+    measurements, such as ranges of distance.
     """
     figure, axes = grid(
         len(reliability), 1, 3.2 * len(reliability), f"{log.name}, {estimator}: observed over predicted detections"
@@ -146,7 +147,8 @@ def reliability_diagram(log: Log, estimator: str, reliability: Mapping[str, Reli
 
 
 def error_bands(log: Log, reference: Trajectory, estimator: str, track: Track) -> Figure:
-    """Return a figure of signed errors in x, y and heading over time, of causal and final poses, with 2-sigma bands."""
+    """Return a figure of signed errors in x, y and heading over time, of causal and final poses, with 2-sigma bands.
+    ``log``, ``estimator``: for the title. ``reference``: the true poses. ``track``: the data of the run."""
     rows = (("x", "m"), ("y", "m"), ("heading", "rad"))[: 3 if reference.has_heading else 2]
     figure, axes = grid(
         len(rows), 2, 3.0 * len(rows), f"{log.name}, {estimator}: errors, with 2-sigma bands", shared=True
@@ -177,7 +179,8 @@ def error_bands(log: Log, reference: Trajectory, estimator: str, track: Track) -
 def error_distribution(log: Log, reference: Trajectory, tracks: Mapping[str, Track]) -> Figure:
     """Return a figure of the cumulative distributions of position and heading errors of causal and final poses.
 
-    ``tracks``: by estimator, the data of its run. The axis of errors is logarithmic.
+    ``log``: for the title. ``reference``: the true poses. ``tracks``: by estimator, the data of its run. The axis of
+    errors is logarithmic.
     """
     rows = (("position", "m"), ("heading", "rad"))[: 2 if reference.has_heading else 1]
     figure, axes = grid(len(rows), 2, 4.5 * len(rows), f"{log.name}: distribution of errors")
@@ -220,10 +223,8 @@ def _layers(log: Log) -> list[Marks]:
 
 
 def _plotted_area(log: Log) -> tuple[Array | None, float]:
-    """Return the lower and upper corner (2, 2) [m] of the plotted area, and the height of the figure [100 px].
-
-    The corners are None for a log without a reference.
-    """
+    """Return the lower and upper corner (2, 2) [m] of the plotted area, and the height of the figure [100 px]. The
+    corners are None for a log without a reference."""
     places = (*(m.positions[:, :2] for m in _layers(log)), np.array(log.world.walls).reshape(-1, 2))
     view = _bounding_box(np.concatenate(places), log.reference)
     return view, 8.5 if view is None else float(np.clip(7.0 * np.divide(*(view[1] - view[0])[::-1]) + 1.5, 5.0, 14.0))

@@ -38,7 +38,7 @@ def pooled_rms(values: Sequence[float]) -> float:
 
 
 def pair_seeds(a: Mapping[int, float | None], b: Mapping[int, float | None]) -> tuple[Array, int]:
-    """Return the scores of two methods, paired by seed (K, 2), and the number of seeds that have no pair.
+    """Return the scores of two methods with the same seeds (K, 2), and the number of seeds without a pair.
 
     ``a``, ``b``: {seed: score of the run, None if it has none}. If a method has a single run, it is paired with each
     run of the other method.
@@ -63,7 +63,7 @@ def bounds(figures: Array) -> tuple[float, float]:
 def draw_pooled(clusters: Sequence[Array], *, rms: bool = True) -> Array:
     """Return bootstrap draws (DRAWS, C) of C pooled scores. A draw resamples the logs, and the seeds within each log.
 
-    ``clusters``: for each log, the scores (K, C) of its K seeds. Scores are pooled over seeds, and then over logs with
+    ``clusters``: for each log, the scores (K, C) with K seeds. Scores are pooled over seeds, and then over logs with
     equal weights. ``rms``: whether to pool by the root mean square instead of the mean.
     """
     scores = np.concatenate([np.square(cluster) if rms else cluster for cluster in clusters])
@@ -121,10 +121,8 @@ def mcnemar(a: ArrayLike, b: ArrayLike) -> McNemar:
 
 
 def quantile(values: ArrayLike, share: float) -> float:
-    """Return a quantile of N values, which may be infinite, by numpy's method "inverted_cdf". NaN without values.
-
-    ``share``: probability of the quantile, such as 0.5 for the median.
-    """
+    """Return a quantile of N values, which may be infinite, without interpolation between values. NaN without values.
+    ``share``: probability of the quantile, such as 0.5 for the median. The method is "inverted_cdf" of numpy."""
     known = np.asarray(values, dtype=float)
     return float(np.quantile(known, share, method="inverted_cdf")) if len(known) else math.nan
 

@@ -18,8 +18,8 @@ EQUIVALENCE = 0.01  # relative difference of errors within which estimators are 
 
 
 def further_tables(rows: Sequence[Row], *, rpe: bool) -> dict[str, tuple[str, ...]]:
-    """Return {title of an additional table: keys of its scores}. There is a table of errors after an alignment if the
-    runs have such errors. There is a table of relative errors if ``rpe`` is set."""
+    """Return {title of an additional table: keys of the scores that are its columns}. There is a table of errors after
+    alignment if ``rows``, the runs, have them. There is a table of relative errors if ``rpe`` is true."""
     tables: dict[str, tuple[str, ...]] = {}
     aligned = dict.fromkeys(row["scoring.align"] for row in rows if row.get("scoring.align"))
     if aligned:

@@ -29,8 +29,8 @@ from factors.se2 import Array
 
 @dataclass(frozen=True)
 class Feature:
-    """A kind of point feature. ``find``: a function that returns the keypoints of an image and their descriptors. The
-    descriptors are None for a detector without descriptors."""
+    """A kind of point feature. ``name``: its name in the results. ``find``: a function that returns the keypoints of an
+    image and their descriptors. The descriptors are None for a detector without descriptors."""
 
     name: str
     find: Callable[[Image], tuple[Keypoints, Descriptors | None]]
@@ -97,9 +97,9 @@ def match_scores(
     """Return the scores of the matches between two images. A match is correct if both points lie in the common part of
     the images and their regions overlap.
 
-    ``first``, ``second``: points of the images. ``mutual``: matches of mutual nearest neighbours. ``clear``: mutual
-    matches with a small distance ratio. ``homography`` (3, 3): from the first image to the second. ``shapes``: (height,
-    width, ...) of both images.
+    ``first``, ``second``: all points of the two images. ``mutual``: matches of mutual nearest neighbours. ``clear``:
+    the matches of ``mutual`` with a small distance ratio. ``homography`` (3, 3): maps pixels of the first image to the
+    second. ``shapes``: (height, width, ...) of both images.
     """
     in_first, in_second = common(first, second, homography, shapes)
     features = min(int(np.count_nonzero(in_first)), int(np.count_nonzero(in_second)))

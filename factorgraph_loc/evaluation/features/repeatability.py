@@ -60,7 +60,8 @@ class Candidates:
     ratio: Array
 
     def best(self, chosen: Truths) -> Candidates:
-        """Return pairs from the mask ``chosen`` (M,), at most one per region. Pairs with smaller errors come first."""
+        """Return a one-to-one selection from the pairs with True in the mask ``chosen`` (M,), by ascending error. A
+        pair is omitted if one of its regions is in a pair with a smaller error."""
         taken_first: set[int] = set()
         taken_second: set[int] = set()
         rows = []
@@ -75,10 +76,10 @@ class Candidates:
 
 
 def repeatability(first: Keypoints, second: Keypoints, homography: Array, shapes: Shapes) -> Repeatability:
-    """Return the repeatability of points that are detected in two images.
+    """Return the repeatability scores of points that are detected in two images.
 
-    ``homography`` (3, 3): maps the first image to the second. ``shapes``: (height, width, ...) of both images. Points
-    at the same position with several orientations count as one region.
+    ``homography`` (3, 3): maps pixels of the first image to the second. ``shapes``: (height, width, ...) of both
+    images. Points at the same position with several orientations count as one region.
     """
     in_first, in_second = common(first, second, homography, shapes)
     first, second = distinct(first[in_first]), distinct(second[in_second])
@@ -93,15 +94,17 @@ def repeatability(first: Keypoints, second: Keypoints, homography: Array, shapes
 
 def alike_regions(first: Keypoints, second: Keypoints, homography: Array) -> Candidates:
     """Return one-to-one pairs of points with overlapping regions and a ratio of sizes below :data:`SCALE_RATIO`.
-    Regions are not magnified (see :func:`overlaps`). ``homography`` (3, 3): maps the first image to the second."""
+    ``first``, ``second``: the points of two images. ``homography`` (3, 3): maps pixels of the first image to the
+    second. The radius of a region is proportional to the size of its point."""
     pairs = overlaps(first, second, homography, magnified=False)
     alike = np.maximum(pairs.ratio, 1.0 / pairs.ratio) < SCALE_RATIO
     return pairs.best((pairs.error < OVERLAP_ERROR) & alike)
 
 
 def common(first: Keypoints, second: Keypoints, homography: Array, shapes: Shapes) -> tuple[Truths, Truths]:
-    """Return a mask of the points ``first`` that lie inside the second image after mapping. Also return such a mask of
-    the points ``second`` for the first image. Arguments: see :func:`repeatability`."""
+    """Return masks of the points ``first`` and of the points ``second`` that lie inside the other image after mapping.
+    ``homography`` (3, 3): maps pixels of the first image to the second. ``shapes``: (height, width, ...) of both
+    images."""
     back = invert(homography)
     return (
         inside(project(homography, first.points), shapes[1]),
@@ -110,11 +113,12 @@ def common(first: Keypoints, second: Keypoints, homography: Array, shapes: Shape
 
 
 def overlaps(first: Keypoints, second: Keypoints, homography: Array, *, magnified: bool = True) -> Candidates:
-    """Return candidates for pairs of overlapping regions, with their overlap errors (see :func:`pair_errors`).
+    """Return pairs of points with nearby regions of similar size, with the overlap error of their regions.
 
-    All pairs with an error below :data:`OVERLAP_ERROR` are among the candidates. ``magnified``: if true, both regions
-    are scaled by the same factor, so that the first region has the radius :data:`RADIUS`. Otherwise the radius of a
-    region is :data:`MEASUREMENT` times half the size of its point.
+    They include all pairs with an error below :data:`OVERLAP_ERROR`, but also others. The error is 1 - intersection /
+    union (:func:`pair_errors`). ``homography`` (3, 3): maps pixels of the first image to the second. ``magnified``: if
+    true, both regions are scaled by the same factor, so that the first region has the radius :data:`RADIUS`. Otherwise
+    the radius of a region is :data:`MEASUREMENT` times half the size of its point.
     """
     if len(first) == 0 or len(second) == 0:
         none = np.empty(0, dtype=np.int64)
@@ -135,7 +139,7 @@ def pair_errors(first: Keypoints, second: Keypoints, homography: Array, *, magni
     """Return the overlap errors (N,) between the regions of the N points ``first`` and of the N points ``second``.
 
     The error is 1 - intersection / union, and 1 for points that the homography (3, 3) maps to infinity. ``magnified``:
-    as in :func:`overlaps`.
+    if true, both regions are scaled by the same factor to a fixed radius of the first.
     """
     back = invert(homography)
     radius = np.full(len(first), RADIUS) if magnified else MEASUREMENT * first.sizes / 2.0

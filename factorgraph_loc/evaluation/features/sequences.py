@@ -55,7 +55,8 @@ def project(homography: Array, points: Array) -> Array:
 
 
 def jacobians(homography: Array, points: Array) -> Array:
-    """Return the Jacobian matrices (N, 2, 2) of :func:`project` at ``points`` (N, 2)."""
+    """Return the Jacobian matrices (N, 2, 2) of the mapping :func:`project` at the pixels ``points`` (N, 2) of the
+    first image."""
     w = points @ homography[2, :2] + homography[2, 2]
     return np.asarray(
         (homography[:2, :2] - project(homography, points)[:, :, None] * homography[2, :2]) / w[:, None, None]
@@ -80,7 +81,8 @@ def corners(shape: tuple[int, ...]) -> Array:
 
 
 def view(homography: Array, shape: tuple[int, ...]) -> ViewChange:
-    """Return zoom, rotation and tilt of a ``homography`` at the centre of the first image. ``shape``: of this image."""
+    """Return the zoom, rotation and tilt by which a ``homography`` (3, 3) changes the first image at its centre.
+    ``shape``: (height, width, ...) of the first image."""
     (local,) = jacobians(homography, corners(shape).mean(axis=0, keepdims=True))
     left, axes, right = np.linalg.svd(local)
     turn = left @ right
@@ -115,7 +117,8 @@ def checked(matrix: Array, shape: tuple[int, ...], source: object) -> Array:
 def read_homography(path: Path, shape: tuple[int, ...]) -> Array:
     """Return the homography (3, 3) in a file with nine numbers, or with a matrix in OpenCV's XML format.
 
-    ``shape``: of the first image. Raises InputError if the file cannot be read or :func:`checked` rejects the matrix.
+    ``shape``: (height, width, ...) of the first image. Raises InputError if the file cannot be read or its matrix is
+    not a valid homography.
     """
     text = read_text(path)
     if text.lstrip().startswith("<"):

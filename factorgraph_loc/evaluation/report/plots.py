@@ -45,9 +45,10 @@ class _Row:
 
 
 def ratios(results: Results, comparisons: Sequence[MetricComparison]) -> Picture | None:
-    """Return a plot of each variant's score on each log, divided by the score of the reference variant.
+    """Return a plot of each variant's score on each log, divided by the score of the reference variant. None without
+    ratios.
 
-    A variant is an estimator with its settings. ``comparisons``: one for each metric. Returns None without ratios.
+    A variant is an estimator with its settings. ``results``: all runs. ``comparisons``: one for each metric to plot.
     """
     panels = {}
     for c in comparisons:
@@ -66,10 +67,10 @@ def ratios(results: Results, comparisons: Sequence[MetricComparison]) -> Picture
 def consistency(
     results: Results, trust: Mapping[str, tuple[float, float, float]], nees: Mapping[tuple[str, str], float]
 ) -> Picture | None:
-    """Return a plot of the mean NEES of each variant on each log, of the mean over logs, and of its 95 % interval.
+    """Return a plot of the mean NEES of each variant on each log, with the mean over logs and the expected interval.
 
-    ``trust``: by variant, the mean over logs and the bounds of the interval for correct covariances. ``nees``: by
-    variant and log, the mean NEES. Returns None if there are no values.
+    ``results``: all runs. ``trust``: by variant, the mean over logs and the bounds of the 95 % interval for correct
+    covariances. ``nees``: by variant and log, the mean NEES. Returns None if there are no values.
     """
     rows = []
     for variant, colour in zip(results.variants, cycle(COLOURS), strict=False):
@@ -95,10 +96,10 @@ def times(results: Results, metric: Metric) -> Picture | None:
 
 
 def distributions(results: Results, errors: Mapping[str, Mapping[tuple[str, str], Array]]) -> Picture | None:
-    """Return a plot of the distributions of position errors of causal and final poses.
+    """Return a plot of the distributions of position errors of causal and final poses, None without errors.
 
-    Only logs with errors of every variant are used. ``errors``: by kind of trajectory, variant and log, quantiles of
-    the position error [m]. Returns None without errors.
+    ``errors``: {"causal" or "final": {(variant, log): quantiles of the position error [m]}}. Only logs with errors of
+    every variant are used.
     """
     figure, axes = grid(1, len(KINDS), 5.5)
     for axis, kind in zip(axes[0], KINDS, strict=True):

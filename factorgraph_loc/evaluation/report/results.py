@@ -58,8 +58,9 @@ class RunData:
 
 
 def read_runs(results: Results, metric: str, runs: Runs) -> RunData:
-    """Return the data in the files of all successful runs. ``runs``: returns the files of a run by its key. If a
-    variant ran with several seeds on a log, the trajectory with the median of the score ``metric`` is used."""
+    """Return the data that a report needs from the files of all successful runs. ``results``: the runs. ``runs``: a
+    function that returns the files of a run by its key. ``metric``: key of a score. If a variant ran with several seeds
+    on a log, the trajectory with the median of this score is used."""
     data = RunData()
     chosen = {
         (variant, log): row
@@ -201,8 +202,8 @@ class Results:
         return well[ranked[(len(ranked) - 1) // 2][1]] if ranked else next(iter(well), None)
 
     def compare(self, metric: Metric, reference: str | None = None) -> MetricComparison:
-        """Return a comparison of all variants with a ``reference`` variant. If it is None, the best variant is the
-        reference, and intervals are not computed."""
+        """Return a comparison of all variants with the variant ``reference`` by the score ``metric``. If ``reference``
+        is None, the best variant is the reference, and intervals are not computed."""
         scores = {name: self.scores(metric.key, name) for name in self.variants}
         figures = {name: p for name in scores if (p := self._pool(metric, name, scores[name])) is not None}
         best = _best(metric, scores, figures)

@@ -138,7 +138,8 @@ def p_value(p: float | None) -> str:
 
 
 def uncertainty(metric: Metric, figure: Pooled) -> str:
-    """Return the interval of a pooled score, such as ``[0.1, 0.2]``, or else its range, or "" for a single value."""
+    """Return the 95 % interval of a pooled score as text, such as ``[0.1, 0.2]``, or else its range. Returns "" for a
+    single log or seed. ``metric``: has the unit and the format. ``figure``: the pooled score."""
     if figure.low is not None and figure.high is not None:
         return f"[{metric.text(figure.low)}, {metric.text(figure.high)}]"
     return metric.range(figure.least, figure.most) if figure.count > 1 else ""

@@ -103,9 +103,11 @@ def _interpolated(estimate: PosePath, reference: PosePath, max_gap: float) -> As
 def in_plane(
     pair: Pairs, estimate: Trajectory, reference: Trajectory, names: tuple[str, str] = ("", ""), t0_ns: int = 0
 ) -> Associated:
-    """Return the paired poses ``pair`` of two planar trajectories as poses in space. Pairs with NaN become gaps.
+    """Return the M paired poses ``pair`` of two planar trajectories as three-dimensional poses. Pairs with NaN become
+    gaps.
 
-    ``estimate``, ``reference``: the paired trajectories. ``names``: their names. ``t0_ns``: timestamp of the time 0.
+    ``estimate``, ``reference``: the trajectories, of which only ``has_heading`` is used. ``names``: their names.
+    ``t0_ns``: absolute time [ns] of t = 0.
     """
     known = np.isfinite(pair.poses[:, 0]) & np.isfinite(pair.truth[:, 0])
     kept = np.flatnonzero(known)

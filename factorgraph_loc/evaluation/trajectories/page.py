@@ -94,13 +94,15 @@ def _errors(score: TrajectoryScore) -> Figure:
 
 
 def _abscissa(score: TrajectoryScore) -> tuple[Array, str]:
-    """Return the abscissa (N,) of the plots and its label: times [s], or numbers of poses without timestamps."""
+    """Return the abscissa (N,) of the plots, and its label. It has times [s], or pose numbers from 1 without
+    timestamps."""
     t = score.seconds()
     return (np.arange(1.0, len(score.estimate) + 1), "number of the pose") if t is None else (t, "time [s]")
 
 
 def errors_table(score: TrajectoryScore) -> Rows:
-    """Return a table of the statistics of the errors, with a row for each kind of error that is defined."""
+    """Return the header of a table of errors, and its rows. A row has a kind of error and its statistics as text. Kinds
+    of errors that are undefined have no row."""
     figures, titles = score.figures, dict(ERRORS)
     for delta in score.rpe:
         titles |= {f"{what} per {delta} [{unit}]": f"rpe_{delta}.{what}" for what, unit in UNITS.items()}
@@ -113,7 +115,9 @@ def errors_table(score: TrajectoryScore) -> Rows:
 
 
 def extents(score: TrajectoryScore) -> dict[str, str]:
-    """Return {title: description} of the estimate, the reference, their association, the pieces and the alignment."""
+    """Return a description of what was compared, as {title: text}. The titles are ``estimate`` and ``reference``
+    (number of poses, length), ``pairs`` (number and method of pairing), and ``alignment``. ``pieces`` has the numbers
+    of path sections that relative errors refer to, and is missing without relative errors."""
     rows = {}
     for name, path, poses, length in zip(
         ("estimate", "reference"), (score.estimate, score.reference), score.poses, score.lengths, strict=True

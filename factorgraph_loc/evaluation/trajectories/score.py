@@ -40,7 +40,8 @@ class PoseErrors:
     """K absolute or relative pose errors.
 
     ``position`` (K,) [m]. ``rotation`` (K,) [rad]: an angle, None if a trajectory has no rotations. ``ends`` (K,):
-    index of the pose of an absolute error, or of the last pose of the piece of a relative error.
+    index of the pose of an absolute error. A relative error is over a section of the path, and ``ends`` is the index of
+    its last pose.
     """
 
     position: Array
@@ -48,7 +49,8 @@ class PoseErrors:
     ends: Integers
 
     def figures(self, name: str) -> dict[str, float | None]:
-        """Return the statistics of the errors by key, such as ``NAME.position_rmse``. None if there are no errors."""
+        """Return the statistics of the errors by key, such as ``NAME.position_rmse`` for the ``name`` NAME. The
+        statistics are rmse, mean, median, p95, max, min and std. They are None if there are no errors."""
         figures: dict[str, float | None] = {}
         for what, values in (("position", self.position), ("rotation", self.rotation)):
             statistics = summarize(np.empty(0) if values is None else values)
@@ -185,9 +187,11 @@ def score_paths(
 def pose_errors(
     pair: Associated, *, all_pairs: bool = False
 ) -> tuple[PoseErrors, PoseErrors | None, PoseErrors | None]:
-    """Return the absolute errors, and the relative errors over a metre of path and over a second.
+    """Return three sets of errors: absolute, relative over a metre of path, and relative over a second.
 
-    The relative errors may be None, see :func:`relative_errors`. ``all_pairs``: see :func:`score_paths`.
+    Relative errors are None without rotations. Those over a second are also None without timestamps. ``all_pairs``: if
+    true, relative errors are over overlapping sections of the path, one from each pose. Otherwise the sections are
+    successive.
     """
     estimate, truth = pair.estimate, pair.reference
     distance = np.linalg.norm(estimate.positions - truth.positions, axis=1)
@@ -199,9 +203,11 @@ def pose_errors(
 
 
 def relative_errors(pair: Associated, length: float, unit: str, *, all_pairs: bool = False) -> PoseErrors | None:
-    """Return relative errors over pieces of a path. ``unit``: "m" for a ``length`` of path in metres, "s" for a time.
+    """Return the errors of the estimated motion over each of many sections of a path.
 
-    ``all_pairs``: see :func:`score_paths`. Returns None if there are no rotations, or no timestamps for the unit "s".
+    ``length``, ``unit``: of a section, in metres of path ("m") or in seconds ("s"). ``all_pairs``: if true, a section
+    begins at each pose. Otherwise the sections are successive. Returns None if there are no rotations, or no timestamps
+    for the unit "s".
     """
     estimate, truth = pair.estimate, pair.reference
     if not (estimate.has_rotations and truth.has_rotations):
