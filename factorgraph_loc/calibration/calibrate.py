@@ -22,8 +22,8 @@ class Calibration:
     """The result of a calibration of a rig (the sensors of a robot, with mounting, constants and noise).
 
     ``logs``: names of the logs. ``input_rig``: the rig before the calibration.
-    ``rig``: the learnt rig, or ``input_rig`` if the learnt rig is refused. ``refused``: the reason of the refusal, ""
-    if none. ``knowledge``: the rig and the constants that are learnt from all logs.
+    ``rig``: the learnt rig, or ``input_rig`` if the learnt rig is refused. ``refused``: the reason of the refusal, or
+    "". ``knowledge``: the rig and the constants that are learnt from all logs.
     ``trials``: scores on held-out logs, empty if the logs have no reference or are too short. ``doubts``: warnings.
     """
 
@@ -44,8 +44,8 @@ def calibrate(
     *,
     grids: Path | None = None,
 ) -> Calibration:
-    """Learn the constants of a rig (the sensors of a robot) from ``logs``, and test the learnt rig on held-out logs. If
-    no log has a reference trajectory, smoothing and learning alternate, without a test.
+    """Return the calibration of a rig (the sensors of a robot): its constants learnt from ``logs``, and tested on
+    held-out logs. If no log has a reference trajectory, smoothing and learning alternate, without a test.
 
     ``run(log, estimator)``: runs the named estimator on a log. ``rig``: its values are the means of the priors. None
     means the rig of the first log. ``progress``: called with the number of steps done and the number of all steps.

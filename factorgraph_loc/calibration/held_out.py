@@ -32,7 +32,8 @@ Scores = Mapping[str, Any]
 
 
 class Scored(Protocol):
-    """The ``result`` of a run, and its ``scores`` by :func:`factorgraph_loc.evaluation.metrics.score`."""
+    """A scored run. ``result``: the result of the estimator. ``scores``: the errors of ``result`` by name, from
+    :func:`factorgraph_loc.evaluation.metrics.score`."""
 
     @property
     def result(self) -> RunResult: ...
@@ -46,7 +47,7 @@ Run = Callable[[Log, str], Scored]
 
 @dataclass(frozen=True)
 class Trial:
-    """The runs of an estimator on one held-out section of a log, with the input rig and with the learnt rig.
+    """The scores of an ``estimator`` on one held-out section of a log, with the input rig and with the learnt rig.
 
     ``log``: name of the log. ``scores``: the scores of the run with each rig, by the names in :data:`RIGS`. None if the
     run failed.
@@ -80,8 +81,8 @@ def folds_of(logs: Sequence[Log]) -> list[tuple[list[Log], list[Log]]]:
 
 
 def trials_of(tests: Sequence[Log], initial: Rig, learnt: Rig, run: Run) -> list[Trial]:
-    """Run all :data:`ESTIMATORS` on the held-out sections ``tests``, with the rigs ``initial`` and ``learnt``. Returns
-    one trial for each section and estimator.
+    """Return the scores of runs with the rigs ``initial`` and ``learnt``. There is one trial for each of the
+    :data:`ESTIMATORS` and each held-out section in ``tests``.
 
     ``run(log, estimator)``: runs the named estimator on a log. The rig ``initial`` is omitted if it lacks settings that
     its sensors need.
@@ -127,14 +128,15 @@ def _is_known(trial: Trial, key: str) -> bool:
 def growth(trials: Sequence[Trial]) -> float:
     """Return the ratio of the position RMSE on held-out sections with the learnt rig to that with the input rig.
 
-    It is the geometric mean over the estimators and over causal and final trajectories. Returns NaN without scores of
-    both.
+    It is the geometric mean over the estimators and over causal and final trajectories. Returns NaN if no section has
+    an RMSE with both rigs.
     """
     return _ratio(trials, lambda mine, rig, kind: pooled(mine, rig, f"{kind}.position_rmse"))
 
 
 def _ratio(trials: Sequence[Trial], loss: Callable[[Sequence[Trial], str, str], float]) -> float:
-    """Return the ratio of a loss with the learnt rig to that with the input rig. Returns NaN without scores of both.
+    """Return the ratio of a loss with the learnt rig to that with the input rig. Returns NaN if no trial has scores of
+    both.
 
     ``loss``: a function (trials, rig, kind) that returns a number, where kind is "causal" or "final". The ratio is the
     geometric mean over the estimators and over causal and final trajectories.
@@ -149,7 +151,8 @@ def _ratio(trials: Sequence[Trial], loss: Callable[[Sequence[Trial], str, str], 
 
 
 def _anees_factor(trials: Sequence[Trial], rig: str, kind: str) -> float:
-    """Return the factor (at least 1) between the pooled ANEES of a rig and its ideal. ``kind``: "causal" or "final"."""
+    """Return max(r, 1 / r), where r is the pooled ANEES of a rig divided by its ideal value, the number of dimensions.
+    ``rig``: one of :data:`RIGS`. ``kind``: "causal" or "final"."""
     dimensions = 3.0 if math.isfinite(pooled(trials, rig, f"{kind}.heading_rmse")) else 2.0
     factor = max(pooled(trials, rig, f"{kind}.anees") / dimensions, 1e-9)
     return max(factor, 1.0 / factor)
@@ -173,10 +176,8 @@ def refusal(trials: Sequence[Trial]) -> str:
 
 
 def _section(log: Log, begin: float, end: float) -> Log | None:
-    """Return a section of a log. ``begin``, ``end``: fractions of the time that odometry and reference share.
-
-    Returns None if the section has no measurements, or lacks odometry or the reference.
-    """
+    """Return a section of a log, or None if it has no measurements, or lacks odometry or the reference. ``begin``,
+    ``end``: its ends, as fractions (0 to 1) of the time with both odometry and reference."""
     first, last = overlap(log)
     with suppress(InputError):  # if the section has no measurements
         part = cut(log, first + begin * (last - first), first + end * (last - first))

@@ -35,8 +35,8 @@ TOO_VAGUE = 1.0  # m; a smoothed trajectory with a larger median standard deviat
 class Knowledge:
     """A learnt ``rig``, and the learnt constants, warnings and figures of its ``sensors``, by the name of the sensor.
 
-    ``turns``: for logs without a reference, smoothing and learning alternate. For each iteration, the largest change of
-    a constant in standard errors. Empty for logs with a reference.
+    ``turns``: the largest change of a constant in each iteration, in standard errors. Iterations of smoothing and
+    learning occur for logs without a reference. Otherwise the tuple is empty.
     """
 
     rig: Rig
@@ -78,12 +78,13 @@ def learn(
     grids: Path | None = None,
     like: Knowledge | None = None,
 ) -> Knowledge:
-    """Learn a rig from logs with known trajectories. The constants of each sensor are learnt separately.
+    """Return a rig learnt from logs with known trajectories, its constants and warnings. Each sensor is learnt
+    separately.
 
     ``traced``: logs with trajectories. ``rig``: initial values. ``first``: the rig before the first iteration of
     smoothing and learning, None for ``rig``. ``grids``: path and name prefix of files of detection grids that may be
-    written. ``like``: a result from more logs. The sensor models selected there are used again. Raises InputError if a
-    log is too short.
+    written. ``like``: a result from more logs, or None. The types of sensor models in it are used again. Raises
+    InputError if a log is too short.
     """
     traced = [replace(trace, log=replace(trace.log, rig=rig)) for trace in traced]
     sensors, learnt = {}, rig
@@ -115,11 +116,12 @@ def learn_by_turns(
     grids: Path | None = None,
     progress: Callable[[float, float], None] | None = None,
 ) -> Knowledge:
-    """Learn a rig from ``logs`` without reference trajectories: alternately smooth all logs and learn from the result.
+    """Return a rig learnt from ``logs`` without reference trajectories, its constants and warnings. All logs are
+    smoothed and a rig is learnt from the smoothed trajectories, alternately until the constants converge.
 
-    ``start``: the rig of the first iteration. ``smooth``: runs the smoother on a log. ``grids``: path and name prefix
-    of files of detection grids that may be written. ``progress``: called with the number of smoothed logs so far and
-    its maximum. Raises InputError if a log contains too little information.
+    ``start``: the rig of the first iteration. ``smooth``: a function that runs the smoother on a log. ``grids``: path
+    and name prefix of files of detection grids that may be written. ``progress``: called with the number of smoothed
+    logs so far and its maximum. Raises InputError if a log contains too little information.
     """
     rig, turns, fitted = start, list[float](), dict[tuple[str, str], float]()
     while True:
@@ -144,9 +146,10 @@ def learn_by_turns(
 
 
 def _smoothed(log: Log, smooth: Smooth) -> Traced:
-    """Smooth a log, and return it with the smoothed trajectory as reference.
+    """Return a log with the trajectory of the smoother as reference. ``smooth``: a function that runs the smoother on a
+    log.
 
-    Raises InputError if the robot is not localized, or the median position sigma exceeds :data:`TOO_VAGUE`.
+    Raises InputError if the robot is not localized, or if the median position sigma exceeds :data:`TOO_VAGUE`.
     """
     result = smooth(log)
     final = result.final
@@ -165,6 +168,7 @@ def _smoothed(log: Log, smooth: Smooth) -> Traced:
 
 
 def _change(constant: FittedConstant, fitted: Mapping[tuple[str, str], float]) -> float:
-    """Return the change of a constant in an iteration, in standard errors. ``fitted``: the previous values."""
+    """Return the absolute change of a constant in an iteration, in standard errors. ``fitted``: the values of the
+    previous iteration by (sensor, name of the constant)."""
     change = abs(constant.fitted - fitted.get((constant.sensor, constant.name), constant.initial))
     return change / constant.error if change > 0.0 else 0.0

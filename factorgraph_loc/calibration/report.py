@@ -28,7 +28,8 @@ VIEW = 5.0  # standard deviations; larger residuals are drawn at the edge
 
 
 def constants_table(constants: Sequence[FittedConstant], logs: Sequence[str] = ()) -> Rows:
-    """Return a table (header, rows) of constants: initial value, learnt value with standard deviation, prior.
+    """Return a table of constants: initial value, learnt value with standard deviation, prior. The table is a tuple of
+    the header and the list of rows.
 
     ``logs``: names of the logs. If there are any, the table also has the values that are learnt from each log
     separately.
@@ -43,10 +44,8 @@ def constants_table(constants: Sequence[FittedConstant], logs: Sequence[str] = (
 
 
 def accuracy_table(calibration: Calibration) -> Rows:
-    """Return a table (header, rows) of errors with the input rig and a learnt rig, on each held-out log and on all.
-
-    For each held-out log, the rig is learnt from the other logs.
-    """
+    """Return a table of errors with the input rig and a learnt rig, on each held-out log and on all. The table is a
+    tuple of the header and the list of rows. For each held-out log, the rig is learnt from the other logs."""
     header = ("held-out log", "estimator", "rig", *(f"{kind} {name}" for kind in KINDS for name in FIGURES))
     rows = []
     logs = dict.fromkeys(t.log for t in calibration.trials)
@@ -163,7 +162,8 @@ def _tables(figures: Mapping[str, Any]) -> list[Part]:
 
 
 def _residuals_figure(logs: Sequence[Residuals]) -> Picture:
-    """Draw the residuals of a sensor, a row of panels per column: distribution, and size over distance and time."""
+    """Return a figure of the residuals of a sensor. It has a row of three panels for each quantity: a histogram, the
+    residuals over distance, and the residuals over time. ``logs``: the residuals of each log."""
     known = [i for i in range(len(logs[0].units)) if any(np.isfinite(log.errors[:, i]).any() for log in logs)]
     figure, axes = grid(len(known), 3, 4.0 * len(known))
     for panels, column in zip(axes, known, strict=True):

@@ -74,7 +74,8 @@ class Posterior:
         return {p.name: float(v) for p, v in zip(self.parameters, self.values, strict=True)}
 
     def correlations(self) -> list[tuple[str, str, float]]:
-        """Return tuples (name, name, correlation) of pairs with an absolute correlation above :data:`CORRELATED`."""
+        """Return a tuple (name, other name, correlation) for each pair of parameters with an absolute correlation above
+        :data:`CORRELATED`."""
         matrix = self.covariance / np.outer(self.errors, self.errors)
         rows, columns = np.nonzero(np.abs(np.triu(matrix, 1)) > CORRELATED)
         names = [p.name for p in self.parameters]
@@ -156,8 +157,9 @@ def independent_share(scores: Array, information: Array, precision: Array | floa
 def least_squares(whitened: Callable[[Array], Array], parameters: Sequence[Parameter], block: Integers) -> Likelihood:
     """Return a likelihood for :func:`maximise` from residuals, by numerical derivatives and the soft-L1 loss.
 
-    ``whitened(values)``: returns residuals (M, D) in standard deviations, for parameter values (P,). ``block`` (M,):
-    the time interval of each row of the residuals, from :func:`blocks`. Errors in different intervals are independent.
+    ``whitened(values)``: returns residuals (M, D) in standard deviations, for parameter values (P,). ``parameters``:
+    the P parameters, which determine the steps of derivatives. ``block`` (M,): the index of the time interval of each
+    row of residuals, from :func:`blocks`. Errors in different intervals are independent.
     """
     steps = STEP * np.diag([p.sigma for p in parameters])
 
@@ -174,17 +176,17 @@ def least_squares(whitened: Callable[[Array], Array], parameters: Sequence[Param
 
 
 def by_block(scores: Array, block: Integers) -> Array:
-    """Return the sums (B, P) of the rows of ``scores`` (M, P) that have equal numbers ``block`` (M,). Row b of the
-    result is the sum of the rows with number b."""
+    """Return the sums (B, P) of rows of ``scores`` (M, P) by group. ``block`` (M,): the group index of each row, from
+    0. Row b of the result is the sum of the rows of ``scores`` with index b."""
     out = np.zeros((int(block.max(initial=0)) + 1, scores.shape[1]))
     np.add.at(out, block, scores)
     return out
 
 
 def blocks(times: Sequence[Array], length: float) -> Integers:
-    """Return the number of the time interval of each measurement in several logs, in one array. ``times``: an array of
-    times [s] for each log. ``length`` [s]: the length of the intervals, which are numbered consecutively over all
-    logs."""
+    """Return the index of the time interval of each measurement, in one array for all logs. ``times``: for each log,
+    the times [s] of its measurements. ``length``: the length of an interval [s]. The intervals of a log are numbered
+    after those of the previous log, so that no two logs share an index."""
     out: list[Integers] = []
     first = 0
     for t in times:

@@ -34,7 +34,7 @@ Columns = Mapping[str, slice]  # the indices of each block in the vector of the 
 
 @dataclass(frozen=True)
 class Term:
-    """A factor of the graph on one robot pose and on named blocks of the state (such as a landmark's position).
+    """A ``factor`` of the graph on one robot pose and on named blocks of the state (such as a landmark's position).
     ``blocks``: the names of these blocks. ``rows``: the dimension of the residual."""
 
     factor: Factor
@@ -60,7 +60,7 @@ class Observation(Protocol):
     def found(self) -> int: ...
     @property
     def work(self) -> int:
-        """The approximate time to compute the likelihood of one pose. The unit is the time that one RFID tag needs."""
+        """The approximate time to compute the likelihood of one pose, in multiples of the time for one RFID tag."""
 
     @property
     def things(self) -> frozenset[Hashable]:
@@ -78,9 +78,10 @@ class Observation(Protocol):
         self, pose: Array, covariance: Array, values: Blocks, columns: Columns, iterations: int = 1
     ) -> Correction:
         """Return the Kalman correction of a Gaussian estimate of the pose and the blocks by this observation. ``pose``
-        (3,) and ``values``, the value (d,) of each block by name: the mean. ``covariance`` (S, S): that of the error
-        state. The first three components of the error state are the body-frame perturbation of the pose. ``columns``:
-        the indices of each block in the error state. ``iterations``: the number of linearisations."""
+        (3,) and ``values``, the value (d,) of each block by name: the mean of the estimate. ``covariance`` (S, S): the
+        covariance of the error state. The first three components of the error state are the body-frame perturbation of
+        the pose. ``columns``: the indices of each block in the error state. ``iterations``: the number of
+        linearisations."""
 
     def log_likelihood(self, poses: Array, values: Blocks) -> Array:
         """Return the log-likelihood (N,) of ``poses`` (N, 3), up to a constant. ``values``: the values (N, P) of each
@@ -91,16 +92,18 @@ class Observation(Protocol):
         ``spreads``: their covariances (d, d) by name, which are added to the noise."""
 
     def at_its_time(self) -> Observation | None:
-        """Return an observation that depends on the pose at its time ``t`` alone, or None if this is impossible."""
+        """Return an equivalent observation of the pose at the time ``t`` of the measurement, or None if not
+        implemented. The original may depend on an earlier pose and the odometry since then."""
 
 
 @dataclass(frozen=True)
 class NewVariable:
-    """A new block of the state: the position of a landmark that is seen for the first time, or a variable with a prior.
+    """A new block ``name`` of the state: the position of a new landmark, or any variable with a prior.
 
     ``mean`` (d,): the initial estimate. ``by_pose`` (d, 3): its Jacobian by the body-frame perturbation of the pose.
-    ``by_block``: its Jacobians (d, P) by other blocks. ``noise`` (d, d): its covariance if the pose and these blocks
-    were exact. ``sightings``: times [s] and observations that give ``mean``. If empty, mean and noise are a prior.
+    ``by_block``: its Jacobian (d, P) by each other block, by name. ``noise`` (d, d): its covariance if the pose and
+    these blocks were exact. ``sightings``: pairs of a time [s] and an observation from which ``mean`` is computed. If
+    empty, ``mean`` and ``noise`` are a prior.
     """
 
     name: str
@@ -133,8 +136,9 @@ class EarlierPose:
 
 @dataclass(frozen=True)
 class Link:
-    """A factor on two robot poses: first the pose at ``t`` [s], then the pose at ``earlier`` [s]. ``t``: the time of
-    the measurement. ``earlier``: a time that :meth:`View.earlier` returned. ``rows``: dimension of the residual."""
+    """A ``factor`` on two robot poses: first the pose at ``t`` [s], then the pose at ``earlier`` [s]. ``t``: the time
+    of the measurement. ``earlier``: a time that :meth:`View.earlier` returned. ``rows``: the dimension of the
+    residual."""
 
     t: float
     earlier: float
@@ -149,8 +153,8 @@ class Binding:
     ``setup``: rig, map and sensors of the run. ``motion``: the odometry. ``diagnostics``: receives the innovations.
     ``use``: "known" to use the landmarks of the map, "extended" to estimate further landmarks, "unknown" to estimate
     all landmarks. ``points``: the same choice for image points and for landmarks with range alone or bearing alone.
-    ``calibration``: the constants to estimate, "particles" for those that may differ between particles. ``name``: the
-    name of the sensor if the rig has several of its type, otherwise "".
+    ``calibration``: which constants are estimated: "all", "none", or "particles" for those that may differ between
+    particles. ``name``: the name of the sensor if the rig has several of its type, otherwise "".
     """
 
     setup: Setup
@@ -211,7 +215,7 @@ class Finder(Protocol):
 
     @property
     def newest(self) -> ChainState | None:
-        """The odometry state at the last measurement that gave information, or None before the first one."""
+        """The integrated odometry at the last measurement that gave information, or None before the first one."""
 
     @property
     def hypotheses(self) -> Sequence[Mode]:
@@ -226,7 +230,7 @@ class Finder(Protocol):
         of ``m``. Returns False if ``m`` gives no information."""
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
-        """Return ``count`` random poses (N, 3) at the last informative measurement, drawn from ``hypotheses``."""
+        """Return ``count`` = N random poses (N, 3) at the last informative measurement, drawn from ``hypotheses``."""
 
     def follow(self, observation: Any, odometry: ChainState, view: View) -> None:
         """Store an observation for :meth:`refuted_since`. ``odometry``: the odometry state at the time of the
@@ -243,9 +247,9 @@ class Finder(Protocol):
 
 
 class Sensor:
-    """Base class of exteroceptive sensors. Construct one object for each run. Subclasses override the methods they
-    need. ``name``: the name of the sensor, by default ``modality``. Its calibration constants are a block of the state
-    with this name."""
+    """Base class of exteroceptive sensors. Construct one object for each run. Subclasses override the methods that they
+    need. ``name``: the name of the sensor, by default ``modality``. The state block with this name contains the
+    sensor's estimated calibration constants."""
 
     modality: ClassVar[str]  # the kind of the sensor's measurements, such as "rfid"
     lost: ClassVar[str] = ""  # the reason in the message if this sensor rejects the estimated pose
@@ -297,17 +301,18 @@ class Sensor:
         model or the map must be wrong."""
 
     def gathered(self, observations: Sequence[Any]) -> list[Term]:
-        """Return the graph factors of observations of the same pose. A subclass may merge them into fewer factors."""
+        """Return the graph factors of ``observations`` of one pose. A subclass may merge them into fewer factors."""
         return [term for observation in observations for term in observation.terms]
 
     def at_end(self, factor: Factor, width: float) -> Factor | None:
         """Return the factor that replaces ``factor`` when the whole graph is solved after a run, or None to omit it.
-        ``width``: factor on the scale of the robust loss, above 1 in the first steps of graduated non-convexity."""
+        ``width``: the multiplier of the scale of the robust loss, above 1 in the first steps of graduated
+        non-convexity."""
         return factor
 
     def convex_width(self, factor: Factor, values: Sequence[Array]) -> float:
-        """Return the smallest ``width`` of :meth:`at_end` that makes the loss of ``factor`` convex at the variables
-        ``values``."""
+        """Return the smallest ``width`` of :meth:`at_end` with which the loss of ``factor`` is convex. ``values``: the
+        values of the factor's variables, the pose first."""
         return 1.0
 
     def rewind(self, t: float) -> None:
@@ -323,7 +328,7 @@ WORK = 20  # computing time of one residual and its robust loss, relative to one
 @dataclass(frozen=True)
 class ResidualObservation:
     """An observation that consists of residual factors (:class:`~factors.sighting.SightingFactor`) of one sensor.
-    ``t``: its time [s]. ``terms``: the factors. Limitation: ``log_likelihood`` evaluates one pose after the other."""
+    ``t``: time [s]. ``terms``: the factors. Limitation: ``log_likelihood`` evaluates one pose after the other."""
 
     t: float
     terms: tuple[Term, ...]

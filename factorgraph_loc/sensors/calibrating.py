@@ -94,8 +94,9 @@ class Calibrator:
         raise NotImplementedError
 
     def with_priors(self, rig: Rig, first: Rig) -> Rig:
-        """Return ``rig`` with the uncertainties of the sensor's constants from ``first``. Use this if smoothing of logs
-        and calibration alternate, because smaller uncertainties would keep the constants near their last values."""
+        """Return a copy of ``rig`` with the standard deviations of the sensor's constants from ``first``. Use this if
+        smoothing and calibration of logs alternate. With the smaller values of ``rig``, the constants would stay near
+        their last values."""
         if not hasattr(rig.section(self.section), "uncertainty"):
             return rig
         uncertainty = first.section(self.section).uncertainty
@@ -172,12 +173,12 @@ class ConstantsCalibrator(Calibrator):
 
     def with_noise(self, parts: Sequence[Any], settings: Any) -> tuple[Sequence[Any], Any]:
         """Return ``parts`` and ``settings``, both updated with noise that is estimated from the residuals. ``parts``:
-        the result of :meth:`part` for each log. ``settings``: they contain the constants for these residuals."""
+        the result of :meth:`part` for each log. ``settings``: the constants with which residuals are computed."""
         return parts, settings
 
     def finished(self, _parts: Sequence[Any], _rig: Rig, knowledge: SensorKnowledge) -> SensorKnowledge:
-        """Return the result of the calibration. Subclasses add noise or plots to ``knowledge``, the fitted constants.
-        ``_parts``: the result of :meth:`part` for each log. ``_rig``: the rig with the estimated constants."""
+        """Return the result of the calibration: ``knowledge``, the fitted constants, to which subclasses add noise or
+        plots. ``_parts``: the result of :meth:`part` for each log. ``_rig``: the rig with the fitted constants."""
         return knowledge
 
     def learn(

@@ -195,7 +195,8 @@ class Ride:
     rng_of_world: Callable[[str], np.random.Generator]
 
     def times(self, rate: float) -> Array:
-        """Return the times (N,) [s] of the measurements of a sensor with ``rate`` [Hz] during the drive."""
+        """Return the times (N,) [s] of the measurements during the drive of a sensor with ``rate`` measurements per
+        second."""
         return times(rate, self.truth)
 
 
@@ -228,7 +229,7 @@ class LiveSensor(Protocol):
 
 
 def times(rate: float, truth: Trajectory) -> Array:
-    """Return the times (N,) [s] of the measurements of a sensor with ``rate`` [Hz] during the trajectory ``truth``."""
+    """Return the times (N,) [s] of measurements during the trajectory ``truth``. ``rate``: measurements per second."""
     count = int(float(truth.t[-1]) * rate + 1e-9)
     return np.asarray(np.minimum(np.arange(1, count + 1) / rate, truth.t[-1]))
 
@@ -244,17 +245,17 @@ class Forecast(Protocol):
     def information(self, poses: Array, ways: Array) -> Array:
         """Return the expected Fisher information (N, 3, 3) of the measurements at each pose of a path.
 
-        The information is that on the body-frame perturbation of the pose. ``poses`` (N, 3): the poses of the path.
+        It is the information on the body-frame perturbation of the pose. ``poses`` (N, 3): the poses of the path.
         ``ways`` (N,): the length [m] of the path segment that ends at each pose. A turn on the spot counts as the
         distance that the robot would drive in the same time.
         """
 
     def add_log_weights(self, poses: Array, metres: float, stops: Places, seed: np.uint64, out: Array32) -> None:
-        """Simulate measurements of the first J of M particles along a path, and compute their log-likelihood for all
-        particles.
+        """Simulate measurements of the first J of M particles on a path, and add their log-likelihoods for all
+        particles to ``out``.
 
         ``out`` (J, M): the log-likelihood of particle m for the measurements of particle j is added to ``out[j, m]``.
-        ``poses`` (S, M, 3): the pose of each particle at S points of the path. ``metres``: the length of the path, with
-        turns as in :meth:`information`. ``stops`` (M,): the number of these points that each particle reaches.
+        ``poses`` (S, M, 3): the pose of each particle at S points of the path. ``metres``: the length [m] of the path,
+        with turns as in :meth:`information`. ``stops`` (M,): the number of these points that each particle reaches.
         ``seed``: calls with the same seed use the same random numbers.
         """

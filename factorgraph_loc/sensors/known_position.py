@@ -32,7 +32,8 @@ class KnownPosition:
 
     @property
     def odometry(self) -> ChainState:
-        """The odometry state at the time of the prior. Before :meth:`settle`, later odometry may change it."""
+        """The odometry state at the time of the prior. Before :meth:`settle` is called, rows of odometry that are added
+        later may change it."""
         return self.motion.state(self.t) if self._odometry is None else self._odometry
 
     def settle(self) -> None:
@@ -50,8 +51,8 @@ class KnownPosition:
         return PosePrior(self.t, np.append(self.prior.pose[:2], heading), covariance)
 
     def mode(self, now: ChainState) -> Mode:
-        """Return a Gaussian of the pose at the odometry state ``now``, from start position and odometry alone. Its
-        ``weight`` is 1."""
+        """Return a Gaussian of the pose at the odometry state ``now``, computed from start position and odometry alone.
+        Its ``weight`` is 1."""
         x, y, turned = self.motion.relative(self.odometry, now).delta
         covariance = self.prior.covariance.copy()
         covariance[:2, :2] += 0.5 * (x**2 + y**2) * np.eye(2)  # displacement in an unknown direction
@@ -64,9 +65,9 @@ class KnownPosition:
         return se2.compose(starts, self.motion.relative(self.odometry, now).delta)
 
     def drawn(self, rng: np.random.Generator, count: int, now: ChainState) -> Array:
-        """Return ``count`` random poses (N, 3) at the odometry state ``now``. The start positions are drawn from the
-        prior. The start headings are stratified over the full circle. The odometry and its noise move the starts to the
-        poses."""
+        """Return ``count`` = N random poses (N, 3) at the odometry state ``now``: random start poses, moved by the
+        odometry with random errors. The start positions are drawn from the prior. The start headings are stratified
+        over the full circle."""
         moved = self.motion.relative(self.odometry, now)
         positions = self.prior.pose[:2] + positive.draws(self.prior.covariance[:2, :2], count, rng)
         headings = (rng.permutation(count) + rng.random(count)) * 2.0 * math.pi / count - math.pi
@@ -110,8 +111,8 @@ class KnownPosition:
         return np.linalg.solve(root, error[0]), np.linalg.solve(root, jacobian[0]), moved.covariance
 
     def _linearized(self, poses: Array, now: ChainState, noise: Array | None) -> tuple[Array, Array, Array]:
-        """Return errors (N, 2) of start positions, their Jacobians (N, 2, 3) by the poses, and their covariances
-        (N, 2, 2). The start positions follow from ``poses`` (N, 3) and the odometry. For the arguments see
+        """Return errors (N, 2) [m] of start positions, their Jacobians (N, 2, 3) by the poses, and their covariances
+        (N, 2, 2). The start positions are computed from ``poses`` (N, 3) at the odometry state ``now``. ``noise``: see
         :meth:`loss`."""
         moved = self.motion.relative(self.odometry, now)
         back = se2.inverse(moved.delta)

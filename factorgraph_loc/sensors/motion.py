@@ -93,8 +93,9 @@ class Motion(OdometryChain):
         self._diagnostics = diagnostics
 
     def add(self, m: Measurement) -> None:
-        """Add one measurement of odometry or gyro, or several as :class:`~factorgraph_loc.model.measurement.Rows`. The
-        diagnostics count rows of unused sensors as ignored and rows that are too old as late."""
+        """Add one measurement of odometry or gyro, or several as :class:`~factorgraph_loc.model.measurement.Rows`. Rows
+        of sensors that are not used are counted as ignored in the diagnostics. Rows with times before the stored
+        history are counted as late."""
         kept: int
         match m:
             case Rows(kind=kind) if kind is VelocityOdometry and self._use_wheels:
@@ -125,8 +126,8 @@ class Motion(OdometryChain):
         return Increment(delta, increment.covariance, increment.duration, increment.still)
 
     def poses_at(self, start: ChainState, t: Array, constants: Array) -> Array:
-        """Return the robot's poses (R, 3) at times ``t`` (R,) [s], in the robot frame at the odometry state ``start``.
-        The motion is corrected with the estimated ``constants`` (P,), to first order."""
+        """Return the robot's poses (R, 3) at times ``t`` (R,) [s] by odometry, in the robot frame at the odometry state
+        ``start``. The motion is corrected with the estimated ``constants`` (P,), to first order."""
         states = self.states(t)
         deltas = se2.between(np.array((start.x, start.y, start.heading)), states[:, 1:4])
         if not self.constants.names:
@@ -138,13 +139,14 @@ class Motion(OdometryChain):
         return np.asarray(se2.exp(moved))
 
     def slip(self, increment: Increment) -> tuple[Array, float]:
-        """Return the covariance (3, 3) to add to an increment with slip, and the negative log-probability of slip."""
+        """Return the covariance (3, 3) to add to the motion ``increment`` if the wheels slip, and the negative
+        log-probability that they slip."""
         return slip(self.model, increment, use_gyro=self._use_gyro)
 
 
 def whole_motion(log: Log, sensors: Sequence[str]) -> Motion:
-    """Return the integrated odometry of a whole log, without a limit of age. ``sensors``: names of the sensors to use,
-    "odometry" or "imu" or both."""
+    """Return the integrated odometry of a whole log, without deletion of old rows. ``sensors``: names of the sensors to
+    use, "odometry" or "imu" or both."""
     motion = Motion(log.rig, tuple(sensors), Diagnostics())
     motion.horizon = math.inf
     for m in log.measurements(sensors):

@@ -105,7 +105,8 @@ def sensors() -> Mapping[str, SensorType]:
 
 
 def sensor(name: str) -> SensorType:
-    """Return the type of the sensor ``name``, or of the sensor with a channel ``name``. Raises InputError otherwise."""
+    """Return the type of the sensor ``name``, or of the sensor with a channel ``name``. Raises InputError if no sensor
+    or channel has this name."""
     if name in sensors():
         return sensors()[name]
     if name in channels():
@@ -125,7 +126,7 @@ def about(name: str) -> str:
 
 @cache
 def channels() -> Mapping[str, Channel]:
-    """Return all channels by name. The option ``--sensors`` uses these names."""
+    """Return all channels of all sensors by name. These names are the possible values of the option ``--sensors``."""
     return {channel.name: channel for sensor in sensors().values() for channel in sensor.channels}
 
 

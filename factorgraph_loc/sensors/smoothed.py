@@ -66,8 +66,9 @@ class Corrections:
 def pooled(corrections: Sequence[tuple[float, float]], known: float) -> Corrections:
     """Return the mean of corrections of a constant over N logs, and the scatter between logs without estimation errors.
 
-    ``corrections``: N pairs of a correction and its standard deviation. ``known``: the standard deviation in the input
-    rig. The scatter is averaged with ``known``, which has the weight of :data:`WORTH` logs.
+    ``corrections``: N pairs of a correction and its standard deviation. ``known``: the standard deviation of the
+    constant in the input rig. The returned scatter is an average with ``known``, which has the weight of :data:`WORTH`
+    logs.
     """
     each, errors = np.array(corrections).T
     beyond = float(np.sum((each - each.mean()) ** 2) - (len(each) - 1) * np.mean(errors**2))
@@ -76,8 +77,8 @@ def pooled(corrections: Sequence[tuple[float, float]], known: float) -> Correcti
 
 
 def corrections_of(name: str, traced: Sequence[Traced]) -> list[tuple[float, float]]:
-    """Return a pair for each log: the correction of the constant ``name`` and its standard deviation. Returns [] if a
-    log lacks an estimate of the constant."""
+    """Return a pair for each log: the estimated correction of the constant ``name``, and its standard deviation.
+    Returns [] if a log lacks an estimate of the constant."""
     corrections = [trace.constants[name] for trace in traced if trace.constants and name in trace.constants]
     return corrections if len(corrections) == len(traced) else []
 

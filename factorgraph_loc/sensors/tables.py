@@ -37,8 +37,8 @@ Columns = Mapping[str, Array | Integers | Sequence[str]]
 @dataclass(frozen=True)
 class Reading:
     """Arguments of ``Channel.assemble``. ``rig``: the robot and its sensors. ``t0_ns``: the absolute time of t = 0
-    [ns]. ``warnings``: a list to append warnings to. ``shared``: values by name that sensors share, such as a map
-    origin."""
+    [ns]. ``warnings``: a list to append warnings to. ``shared``: values by name that several sensors use, such as the
+    origin of latitudes and longitudes."""
 
     rig: Rig
     t0_ns: int
@@ -65,7 +65,7 @@ def tables_of(channel: Channel) -> tuple[Table, ...]:
 
 @cache
 def native_tables() -> Mapping[str, tuple[Channel, tuple[Table, ...]]]:
-    """Return all tables of the native format by name: the channel and the alternative formats of each table."""
+    """Return the channel and the alternative formats of each table of the native format, by the name of the table."""
     return {
         table.name: (channel, tuple(candidate for candidate in tables_of(channel) if candidate.name == table.name))
         for channel in channels().values()

@@ -124,7 +124,8 @@ def _features(
 
 def _from_cache(file: Path, about: str, kept: FeatureCache) -> _ImageFile:
     """Return an image file with its features from the cache ``kept``, or with the features None if the cache lacks
-    them. The cache key is a hash of the bytes of ``file`` and of the text ``about``."""
+    them. The cache key is a hash of the bytes of ``file`` and of ``about``, a text with the settings of feature
+    detection."""
     try:
         content = read_bytes(file, IMAGE)
     except InputError as error:
@@ -135,8 +136,8 @@ def _from_cache(file: Path, about: str, kept: FeatureCache) -> _ImageFile:
 
 
 def _find(file: Path, key: str, settings: FrontendSettings, size: Size, kept: FeatureCache) -> _ImageFile:
-    """Return the features of an image, or the error message if the file is unusable. The features are written to the
-    cache ``kept`` with the ``key``. ``size``: width and height of the camera's images [px]."""
+    """Return an image file with its detected features, or with the error message if it is unusable. The features are
+    also written to the cache ``kept`` under ``key``. ``size``: width and height of the camera's images [px]."""
     try:
         image = read_image(file)
     except InputError as error:
@@ -163,7 +164,7 @@ def _extractor(settings: FrontendSettings) -> Extractor:
 
 
 def _empty_features(settings: FrontendSettings) -> ImageFeatures:
-    """Return the (empty) features of an image without features."""
+    """Return features of length 0, for an image that cannot be used. Their type is that of detected features."""
     return decode(encode(*_extractor(settings).detectAndCompute(np.zeros((16, 16), dtype=np.uint8))))
 
 
@@ -175,8 +176,8 @@ def _tracks(
     camera: CameraModel,
     kept: FeatureCache,
 ) -> list[Integers]:
-    """Return the track numbers (K,) of the K features of each image, from the cache ``kept`` if possible. A track is a
-    point that occurs in several images."""
+    """Return the track number (K,) of each of the K ``features`` of each image, from the cache ``kept`` if possible.
+    Features of the same point in several images have the same number. A feature without a match has its own number."""
     order = np.argsort(stream.t, kind="stable").tolist()
     about = f"tracks {settings.feature} {camera.intrinsics().tolist()} {code_version(TRACK_CODE)} "
     key = hashlib.sha256(

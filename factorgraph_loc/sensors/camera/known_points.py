@@ -118,8 +118,8 @@ class KnownPoints:
         return inexact
 
     def named(self, m: PixelSightings) -> ReprojectionFactor | None:
-        """Return the factor of all points in ``m`` that are in the map, or None without such points. It depends on the
-        pose at the time of ``m``. Outliers are not removed."""
+        """Return the factor of all points in ``m`` that are in the map, or None if no point is. The factor depends on
+        the pose at the time of ``m``. Outliers are not removed."""
         places = [self.map.index.get(name, -1) for name in m.points]
         pixels = m.pixels
         if -1 in places:
@@ -204,8 +204,8 @@ class KnownPoints:
         return ReprojectionFactor(model, self.map.positions[points], pixels, point_covariances=covariances)
 
     def _empty_factor(self, m: CameraFrame) -> ReprojectionFactor | None:
-        """Return a factor without points, as a start for the caller. Returns None if the features in ``m`` cannot be
-        matched."""
+        """Return a factor without points, to which the caller adds matched points. Returns None if the features in
+        ``m`` cannot be matched, for example because the map has features of another kind."""
         self.names = ()
         if self.associator is None:
             if not self._others_matter:

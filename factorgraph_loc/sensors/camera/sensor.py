@@ -88,8 +88,9 @@ class PixelObservation(ResidualObservation):
         return reprojection.log_likelihood(factor.model, poses, factor.points, factor.pixels, tilts, covariances)
 
     def on_pose(self, values: Blocks, spreads: Blocks) -> Self:
-        """Return an observation that depends on the pose only. ``values``: estimates of the camera's constants and of
-        displacements of points, by block. ``spreads``: their covariances by block, which are added to the noise."""
+        """Return an observation that depends on the pose only. ``values``: the estimates of the camera's constants and
+        of the displacements of points, by the name of the state block. ``spreads``: their covariances by the same
+        names, which are added to the noise."""
         if not self.blocks:
             return self
         seen, held, blocks = self.seen, None, self.blocks
@@ -255,7 +256,8 @@ class PixelFinder:
 
     @property
     def best(self) -> PosePrior | None:
-        """The pose from the last image if it is reliable or agrees with poses from previous images, otherwise None."""
+        """The pose at the last image with a pose, or None if it is ambiguous. It is unambiguous if the image determines
+        it reliably, or if poses from previous images agree with it."""
         if not self._fixes or not (self._fixes[-1].clear or self._agree()):
             return None
         last = self._fixes[-1]

@@ -30,10 +30,12 @@ if TYPE_CHECKING:
 
 
 def check(use: Use) -> Use:
-    """Return the run ``use``. Its settings are changed to estimate points if the map has no points for the camera.
+    """Return a copy of the run ``use`` that estimates points if the map has no points for the camera, or ``use``
+    itself.
 
-    The change is the setting ``landmarks`` = "unknown" and a warning. It is only made if the user has not set
-    ``landmarks``, the estimator can estimate points, and the run has no other exteroceptive sensors.
+    The copy has the setting ``landmarks`` = "unknown" and a warning. ``use`` is returned if the user has set
+    ``landmarks``, or if the estimator cannot estimate points. It is also returned if the run has other exteroceptive
+    sensors.
     """
     motion = moving(use.sensors, TURN)
     unmapped = use.estimates_points and _uses_camera(use) and not _has_points(use)
@@ -51,8 +53,8 @@ def review(use: Use, _ending: Ending) -> Review:
 
 
 def _doubts(use: Use) -> Iterator[Notice]:
-    """Yield a warning if the run needs points and the map has none. Yield a warning if the settings require to estimate
-    points and the estimator cannot."""
+    """Yield a warning if the run needs points and the map has none. Yield a warning if the settings require that points
+    are estimated, but the estimator cannot estimate points."""
     landmarks = getattr(use.settings, "landmarks", "known")
     if _has_points(use):
         if landmarks == "unknown" and not use.estimates_points:

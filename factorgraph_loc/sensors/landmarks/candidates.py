@@ -68,8 +68,8 @@ class LocatedPoint(NamedTuple):
 class Candidate:
     """The sightings of one landmark with an unknown position. Immutable.
 
-    ``sightings``: in order of time. ``sources``: the object that the caller passed with each sighting. ``due``: the
-    number of sightings that the next attempt to locate the landmark requires.
+    ``sightings``: the sightings in order of time. ``sources``: the object that the caller passed with each sighting.
+    ``due``: the number of sightings that the next attempt to locate the landmark requires.
     """
 
     sightings: tuple[PartialSighting, ...] = ()
@@ -77,8 +77,8 @@ class Candidate:
     due: float = FEWEST
 
     def plus(self, sighting: PartialSighting, source: object) -> Candidate:
-        """Return a copy with the further ``sighting``. ``source``: any object, stored with the sighting. The new
-        sighting replaces the last one if the robot moved less than APART [m] between the last two."""
+        """Return a copy with the additional ``sighting``. ``source``: any object, stored with the sighting. The last
+        stored sighting is replaced if the robot had moved less than APART [m] between the last two stored ones."""
         end = len(self.sightings)
         if end > 1:
             previous, last = (np.array(s.odometry[1:3]) for s in self.sightings[-2:])
@@ -154,8 +154,8 @@ class _PathSightings:
         self._common += np.einsum("iap,pq,jbq->ijab", turns, uncertainty, turns)
 
     def positions(self) -> list[LocatedPoint]:
-        """Return possible positions of the landmark, sorted by loss. They are the local optima, and one optimum that
-        starts at the mirror image of the best one."""
+        """Return possible positions of the landmark, sorted by loss. They are the local optima, and the optimum that is
+        reached from the mirror image of the best one at the path."""
         starts = self._starts()
         points = self._refined(starts)
         points = points[np.argsort(self._losses(points))]
@@ -179,9 +179,10 @@ class _PathSightings:
         return np.asarray(middle + 2.0 * (away @ ahead) * ahead - away)
 
     def _linearized(self, points: Array, path: Array | None = None) -> tuple[Array, Array]:
-        """Return residuals (N, K, 2), whitened by the sensor noise, and their Jacobians (N, K, 2, 11), with columns as
-        in :func:`linearize_each`. ``points`` (N, 2): positions of the landmark. ``path`` (K, 3): the robot's poses at
-        the sightings, by default from odometry."""
+        """Return residuals (N, K, 2) of range and bearing, whitened by the sensor noise, and their Jacobians (N, K, 2,
+        11). The first columns of a Jacobian are by the pose (3), the next by the position of the landmark. ``points``
+        (N, 2): positions of the landmark. ``path`` (K, 3): the robot's poses at the sightings, by default from
+        odometry."""
         count, size = self.count, len(points)
         sightings = np.repeat(points, count, axis=0), np.tile(self._ranges, size), np.tile(self._bearings, size)
         poses = np.tile(self._back if path is None else path, (size, 1))

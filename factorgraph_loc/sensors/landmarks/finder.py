@@ -338,7 +338,8 @@ class TrackMonitor:
         self.suspicious_since = None
 
     def _beginning(self) -> float:
-        """Return the time [s] that best separates agreeing landmarks from later landmarks that contradict the pose."""
+        """Return the time [s] since which most landmarks contradict the pose. This time best separates agreeing
+        landmarks from later contradicting landmarks."""
         excess = np.array([2 * beyond - count for _, beyond, count in self._stamps])
         return self._stamps[int(np.argmax(np.cumsum(excess[::-1])[::-1]))][0]
 

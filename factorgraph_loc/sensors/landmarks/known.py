@@ -81,7 +81,7 @@ class KnownLandmarks:
 
         ``offset``: the motion from the pose that the factors depend on to the measurement, None if the times are equal.
         ``twist`` (3,): the robot's velocity at the measurement, required if the sensor's time offset is estimated.
-        ``late``: the estimated fraction of late (too long) ranges and their excess.
+        ``late``: the estimated statistics of late ranges, which are too long because the signal was reflected.
         """
         fixed, single, surveyed, unknown = self._usable(m)
         model = with_late(self._model, late)

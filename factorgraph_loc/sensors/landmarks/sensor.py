@@ -121,7 +121,8 @@ class LandmarkObservation(ResidualObservation):
         return frozenset(map(tuple, self.measured.points.tolist()))
 
     def at_its_time(self) -> Self | None:
-        """Return an observation that depends on the pose at its time ``t`` alone, or None if it depends on blocks."""
+        """Return an equivalent observation of the pose at the time ``t`` of the measurement. The original may depend on
+        an earlier pose and the odometry since then. Returns None if it depends on other blocks of the state."""
         if self.blocks:
             return None
         factor = self.measured
@@ -131,8 +132,8 @@ class LandmarkObservation(ResidualObservation):
 
     def on_pose(self, values: Blocks, spreads: Blocks) -> Self:
         """Return an observation that depends on the pose only. ``values``: the estimates (d,) of all blocks by name.
-        ``spreads``: their covariances (d, d) by name. Those of landmarks and range biases are added to the noise, those
-        of calibration constants are not."""
+        ``spreads``: their covariances (d, d) by name. The covariances of landmarks and range biases are added to the
+        noise. Those of calibration constants are ignored."""
         if len(self.terms) == 1 and not self.terms[0].blocks:
             return self
         fixed = []
@@ -173,11 +174,10 @@ class NewLandmarks:
     def propose(
         self, name: str, point: Array, covariance: Array, sighting: Sighted
     ) -> tuple[NewLandmarks, Sighted | None]:
-        """Compare a new sighting with the stored sightings of the landmark ``name``. Returns two values.
+        """Return a copy with the new ``sighting`` of the landmark ``name``, and None. If a stored sighting agrees with
+        it, return a copy without all sightings of the landmark, and the stored sighting.
 
-        ``point`` (2,), ``covariance`` (2, 2): the position of the landmark from the new ``sighting``. If a stored
-        sighting agrees with it: a copy without this landmark, and the stored sighting. Otherwise: a copy that also
-        contains the new sighting, and None.
+        ``point`` (2,), ``covariance`` (2, 2): the position of the landmark from the new ``sighting``.
         """
         waiting = self.pending.get(name, ())
         for earlier, noise, candidate in reversed(waiting):

@@ -272,8 +272,8 @@ def _cost(errors: Array) -> float:
 
 
 def check(use: Use) -> Use:
-    """Return ``use`` unchanged. Raises InputError if the estimator cannot locate any landmark of the log. This is so if
-    the estimator requires sightings with range and bearing, and no sighting has both."""
+    """Return ``use`` unchanged. Raises InputError if the estimator requires sightings with range and bearing to locate
+    landmarks, and no sighting in the log has both."""
     log, wanted = use.log, getattr(use.settings, "landmarks", "known")
     streams = [stream for name, stream in _streams(log).items() if name in use.sensors and len(stream.t)]
     if wanted == "known" or use.estimates_points or not streams:

@@ -72,7 +72,8 @@ class SightingWindow:
         return np.empty((0, 3)) if self._start is None else self._start.candidates(self.now)
 
     def circles(self) -> Array:
-        """Return candidates (N, 3) of the pose at the last sighting, on circles around the sighted landmark."""
+        """Return candidates (N, 3) of the pose at the last sighting, on circles around the landmark of the last
+        sighting."""
         k = len(self.points) - 1
         ranges = RADII if self._missing[k, 0] else (self._ranges[k],)
         bearings = np.arange(HEADINGS) * 2.0 * np.pi / HEADINGS if self._missing[k, 1] else (self._bearings[k],)
@@ -95,9 +96,9 @@ class SightingWindow:
         return self._poses_from(k, headings, ranges, bearings)
 
     def _poses_from(self, k: int, headings: Array, ranges: Array, bearings: Array) -> Array:
-        """Return poses (N, 3) at the last sighting that follow from sighting number ``k`` and the odometry.
-        ``headings`` (N,): robot headings at sighting ``k``. ``ranges``, ``bearings`` (N,): range and bearing of its
-        landmark."""
+        """Return poses (N, 3) at the last sighting, computed from the sighting with index ``k`` and the odometry.
+        ``headings`` (N,): robot headings at sighting ``k``. ``ranges``, ``bearings`` (N,): range [m] and bearing [rad]
+        of its landmark."""
         turned = np.column_stack((np.zeros((len(headings), 2)), headings))
         relative = se2.transform_from(turned, located(self._model, ranges, bearings))
         return se2.compose(np.column_stack((self.points[k] - relative, headings)), self._forth[k])
@@ -199,7 +200,7 @@ class SightingWindow:
         return pose, covariance
 
     def _recent(self) -> list[int]:
-        """Return the row number of the last sighting of each landmark, newest first, for at most RECENT landmarks."""
+        """Return the index of the last sighting of each landmark, newest first, for at most RECENT landmarks."""
         last = {tuple(p): k for k, p in enumerate(self.points.tolist())}
         return sorted(last.values(), reverse=True)[:RECENT]
 
@@ -228,7 +229,8 @@ class SightingWindow:
         return error.reshape(*at.shape[:2], 2), jacobian
 
     def _normal_equations(self, poses: Array, whitener: Array, noise: Array | None) -> tuple[Array, Array]:
-        """Return the Gauss-Newton Hessian (N, 3, 3), with a nearly flat prior, and the gradient (N, 3) of
+        """Return the Gauss-Newton Hessian (N, 3, 3) and the gradient (N, 3) of :meth:`losses` at ``poses`` (N, 3). A
+        small constant is added to the Hessian, so that it is invertible. For ``whitener`` and ``noise`` see
         :meth:`losses`."""
         error, jacobian = self._linearized(poses)
         error, jacobian = (whitener @ error[..., None])[..., 0], whitener @ jacobian

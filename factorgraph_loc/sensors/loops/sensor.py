@@ -53,7 +53,8 @@ class LoopSensor(Sensor):
             yield Link(m.t, earlier.t, factor, factor.rows)
 
     def at_end(self, factor: Factor, width: float) -> Factor:
-        """Return a copy of ``factor`` with the scale of the robust loss multiplied by ``width``."""
+        """Return a copy of ``factor`` for the solution of the whole graph after a run. ``width``: the scale of the
+        copy's robust loss is multiplied by it."""
         return cast(LoopFactor, factor).widened(width)
 
     def convex_width(self, factor: Factor, values: Sequence[Array]) -> float:

@@ -120,7 +120,7 @@ class NoiseFit:
     """The estimated noise of the odometry.
 
     ``growth``: the noise of each error, by name ("along", "lateral", "heading"). ``outliers``: the fraction of windows
-    that are outliers. ``widened``: ``growth`` was multiplied by this factor to explain errors in long windows.
+    that are outliers. ``widened``: the factor by which ``growth`` was multiplied to explain the errors in long windows.
     ``floored``: names of the errors with noise that was raised to its lower bound.
     """
 
@@ -228,8 +228,8 @@ class OdometryCalibrator(ConstantsCalibrator):
     def learn(
         self, traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path | None, like: SensorKnowledge | None = None
     ) -> SensorKnowledge:
-        """Return constants and noise, see :meth:`Calibrator.learn`. The result is empty if the reference has no
-        headings."""
+        """Return constants and noise of the odometry. It is an empty :class:`SensorKnowledge` if the reference has no
+        headings. For the arguments see :meth:`Calibrator.learn`."""
         reference = traced[0].log.reference
         has_heading = reference is not None and reference.has_heading
         return super().learn(traced, rig, first, grids, like) if has_heading else SensorKnowledge()

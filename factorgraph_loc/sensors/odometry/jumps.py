@@ -28,8 +28,8 @@ M = TypeVar("M", bound=VelocityStream | IncrementStream | YawRateStream)
 class Jump(NamedTuple):
     """A jump in one row of odometry.
 
-    ``row``: the number of the row, from 0. ``what``: "speed" or "turn rate". ``unit``: the unit of the rates. ``rate``:
-    the speed or turn rate of the row. ``previous``, ``following``: the rates of the rows before and after it.
+    ``row``: the index of the row. ``what``: "speed" or "turn rate". ``unit``: the unit of the rates. ``rate``: the
+    speed or turn rate of the row. ``previous``, ``following``: the rates of the rows before and after it.
     """
 
     row: int
@@ -98,7 +98,7 @@ def without_jumps(stream: M, rules: RowRules, warnings: list[Notice]) -> M:
     """Return the stream without the rows that have jumps, and append a warning about them to ``warnings``.
 
     ``rules``: the log's rules for bad rows. If they refuse bad rows instead of skipping them, the stream is returned
-    unchanged. The motion of a removed increment is marked as unknown.
+    unchanged. After a removed increment, the next row has the duration of the lost motion in its field ``unknown`` [s].
     """
     if rules.bad_rows == "refuse" or not (events := jumps(stream)):
         return stream

@@ -58,8 +58,9 @@ class DifferentialDrive(FileModel):
     """distance between the wheels"""
 
     def corrected(self, scale_distance: float, scale_rotation: float) -> tuple[float | None, float]:
-        """Return the wheel radius [m] (or None) and the track width [m] that make both scales of the odometry 1.
-        ``scale_distance``, ``scale_rotation``: the present scales, as in :class:`OdometrySettings`."""
+        """Return the wheel radius [m] and the track width [m] that make both scales of the odometry 1. The radius is
+        None if it is not set. ``scale_distance``, ``scale_rotation``: the present scales, as in
+        :class:`OdometrySettings`."""
         radius = None if self.radius is None else self.radius * scale_distance
         return radius, self.track * scale_distance / scale_rotation
 

@@ -182,8 +182,8 @@ def match(rates: Array, delayed: Array) -> RateMatch | None:
 
 
 def _correlation(rates: Array, signal: Array, shift: int) -> tuple[float, float]:
-    """Return the correlation and the slope between ``rates`` and the values of ``signal`` that are ``shift`` rows
-    later. Both are 0 if the robot hardly moves."""
+    """Return the correlation and the slope between ``rates`` (N,) and ``signal`` (N,). Row i of ``rates`` is compared
+    with row i + ``shift`` of ``signal``. Both results are 0 if the robot hardly moves."""
     a = rates[max(0, -shift) : len(rates) - max(0, shift)]
     b = signal[max(0, shift) : len(signal) - max(0, -shift)]
     both = np.isfinite(a) & np.isfinite(b)

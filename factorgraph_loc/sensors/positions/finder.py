@@ -35,8 +35,8 @@ SEARCH_INTERVAL = 1.0  # s between searches while positions contradict the pose
 
 
 class Row(NamedTuple):
-    """A measured position. ``odometry``: the odometry state at its time. ``factor``: a factor on the pose at its
-    time."""
+    """A measured position. ``odometry``: the odometry state at the time of the measurement. ``factor``: a factor on the
+    pose at this time."""
 
     odometry: ChainState
     factor: PositionFactor
@@ -112,8 +112,8 @@ class PositionFinder:
         self._beyond.clear()
 
     def _add(self, odometry: ChainState, factor: PositionFactor) -> None:
-        """Store a position: its ``odometry`` state and its ``factor``. Late positions are skipped. A position replaces
-        the previous one if less than INTERVAL has passed."""
+        """Store a position: its ``odometry`` state and its ``factor``. It is skipped if it is not later than the last
+        stored position. The last stored position is replaced if it is less than INTERVAL after the one before."""
         self._robust = factor.robust
         if self._rows and odometry.t <= self._rows[-1].odometry.t:
             return

@@ -104,8 +104,9 @@ class PositionStream(Stream):
 
 
 def are_plausible(var_x: Any, cov_xy: Any, var_y: Any) -> Any:
-    """Return True for plausible covariances, False for placeholders and NaN. The arguments are the elements [m^2] of
-    one covariance, or arrays (N,) of the elements of N covariances."""
+    """Return True for plausible covariances. Return False for NaN and for variances that are zero, negative or extreme,
+    which some receivers report. The arguments are the elements [m^2] of one covariance, or arrays (N,) of the elements
+    of N covariances."""
     low, high = PLAUSIBLE
     ranges = (low <= var_x) & (var_x <= high) & (low <= var_y) & (var_y <= high)
     return ranges & (np.abs(cov_xy) < np.sqrt(np.abs(var_x)) * np.sqrt(np.abs(var_y)))
@@ -171,7 +172,8 @@ def _with_fix(table: TableRows, warnings: list[Notice]) -> TableRows:
 
 
 def on_map(degrees: Array, origin: Array) -> Array:
-    """Convert latitudes and longitudes (N, 2) [deg] to metres (N, 2) east and north of ``origin`` (1, 2) [deg].
+    """Return the positions (N, 2) [m], east and north of ``origin`` (1, 2) [deg], of ``degrees`` (N, 2): latitudes and
+    longitudes [deg].
 
     The result is accurate within some kilometres. It is the arc length on the radii of curvature at the origin (Groves,
     "Principles of GNSS, Inertial, and Multisensor Integrated Navigation Systems", 2nd edition, 2013, section 2.4.2).

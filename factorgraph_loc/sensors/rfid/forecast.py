@@ -77,8 +77,8 @@ def _uniform(seed: np.uint64, number: int) -> float:
 
 @compiled(error_model="numpy", fastmath=FAST)
 def _cells(tables: ScanTables, t: int, poses: Array, turns: Array32, out: NDArray[np.int32]) -> None:
-    """Write the cell of tag ``t`` at each robot pose in ``poses`` (M, 3) to ``out`` (M,). ``turns`` (2, M): cosines and
-    sines of the robot's headings."""
+    """Write the index of the cell of :class:`ScanTables` that contains tag ``t``, at each robot pose in ``poses`` (M,
+    3), to ``out`` (M,). ``turns`` (2, M): cosines and sines of the robot's headings."""
     size = np.int32(tables.size)
     ends, middle = np.int32(size - 1), np.float32(size // 2 + 0.5)
     first = np.int32(tables.first[t] + (tables.layers - 1) * size * size)
@@ -110,11 +110,13 @@ def log_weights(
     tempering: float,
     out: Array32,
 ) -> None:
-    """Simulate the reads of the first J = ``scans`` of M particles on a path. Compute their log-likelihood for all M.
+    """Simulate the reads of J = ``scans`` of M particles on a path, and write their log-likelihoods for all M to
+    ``out``.
 
-    ``out`` (J, M): receives the log-likelihood of particle m for the reads of particle j. ``poses`` (S, M, 3): the pose
-    of each particle at S points of the path. ``rounds`` (S,): the number of rounds at each point. ``stops`` (M,): the
-    number of points that each particle reaches. ``tempering``: exponent of the likelihood.
+    ``out`` (J, M): row j receives the log-likelihood of each particle for the reads of particle j. ``poses`` (S, M, 3):
+    the pose of each particle at S points of the path. ``rounds`` (S,): the number of rounds at each point. ``stops``
+    (M,): the number of points that each particle reaches. ``seed``: the seed of random numbers. ``tempering``: the
+    exponent of the likelihood.
     """
     steps, count, _ = poses.shape
     tags = len(tables.points)
@@ -145,8 +147,8 @@ def log_weights(
 def _add_reads(
     tables: ScanTables, cells: NDArray[np.int32], rounds: Places, stops: Places, seed: np.uint64, out: Array32
 ) -> None:
-    """Draw random reads, and add their log-likelihoods to ``out``. ``cells`` (S, T, M): the cell of each tag at each
-    pose. The other arguments are those of :func:`log_weights`."""
+    """Draw random reads, and add their log-likelihoods to ``out``, before tempering. ``cells`` (S, T, M): the cell
+    index of each tag at each pose. For other arguments see :func:`log_weights`."""
     steps, tags, count = cells.shape
     antennas = tables.read.shape[1]
     gain = tables.gain

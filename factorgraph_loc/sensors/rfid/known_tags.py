@@ -42,7 +42,8 @@ def trust(sigmas: Array) -> float:
     """Return an exponent for the likelihood of reads, at most 1, that accounts for survey errors of the tags.
 
     ``sigmas`` (T,): standard deviations [m] of the surveyed positions. All reads of a tag share its survey error. The
-    variance after driving past a tag is therefore its survey variance plus the square of :data:`PASS_SIGMA`.
+    variance of the pose after driving past a tag is therefore its survey variance plus the square of
+    :data:`PASS_SIGMA`.
     """
     counted = np.where(sigmas > EXACT * PASS_SIGMA, sigmas, 0.0)
     return float(np.mean(1.0 / (1.0 + (counted / PASS_SIGMA) ** 2))) if len(sigmas) else 1.0
@@ -141,13 +142,14 @@ class KnownTags:
         return np.array([(a.x, a.y) for a in model.antennas]) if model.fixed else self.map.tags.points[:, :2]
 
     def exclude(self, antenna: int) -> str:
-        """Ignore the rounds of the antenna number ``antenna`` until it reads a tag. Returns the antenna's name."""
+        """Ignore the rounds of the antenna with index ``antenna`` until it reads a tag. Returns the antenna's name."""
         self._excluded.add(antenna)
         self._rounds = {}
         return self.antennas[antenna]
 
     def temper(self, tempering: float) -> None:
-        """Set the exponent of the likelihood: the smaller of ``tempering`` and the rig's value, times ``trust``."""
+        """Set the exponent of the likelihood of reads to the smaller of ``tempering`` and the rig's value. It is then
+        multiplied by the result of :func:`trust`, which accounts for survey errors."""
         new = min(self._tempering, tempering) * self.trust
         if new != self.likelihood.model.tempering:
             self.likelihood = self.likelihood.tempered(new)
@@ -198,7 +200,8 @@ class KnownTags:
         return TagReadCounts(np.zeros((len(used), 3)), used, rounds, hits, odds, elsewhere, tags, prior, twists)
 
     def weigh_states(self, counts: TagReadCounts, pose: Array, covariance: Array, parameters: Array) -> TagEvidence:
-        """Return the likelihood of ``counts``, reads and misses, if a tag in range is as surveyed, weak, moved or dead.
+        """Return the likelihood of reads and misses, ``counts``, for each possible state of a tag: as surveyed, weak,
+        moved or dead. It is computed for the tags in range.
 
         ``pose`` (3,) with body-frame ``covariance`` (3, 3): the estimated pose before the scan corrects it.
         ``parameters`` (Q,): the estimated parameters of the read likelihood.
@@ -214,7 +217,8 @@ class KnownTags:
         return counts.with_states(evidence.tags, self.states.odds[evidence.tags], elsewhere)
 
     def without_doubtful(self, reads: TagReadCounts) -> TagReadCounts:
-        """Return a copy of ``reads`` without the effect of tags that are clearly dead, weak or moved."""
+        """Return a copy of ``reads`` with tags that are clearly dead, weak or moved marked as such. These tags then
+        have almost no effect on the likelihood of a pose."""
         clear = self.states.odds[reads.tags] > CLEAR
         if not clear.any():
             return reads
@@ -224,7 +228,8 @@ class KnownTags:
 
     def learn(self, t: float, evidence: TagEvidence) -> None:
         """Update the states of tags with ``evidence`` from a scan at ``t`` [s], the result of :meth:`weigh_states`. The
-        evidence of tags that were read is only used after :data:`CONFIRMED` seconds."""
+        evidence of tags that were read is used :data:`CONFIRMED` seconds later, because a wrong pose is detected until
+        then."""
         is_read, tags, log_likelihoods = evidence.is_read, evidence.tags, evidence.log_likelihoods
         self.states.learn(t, tags[~is_read], log_likelihoods[~is_read])
         self._waiting.append((t, tags[is_read], log_likelihoods[is_read]))
@@ -249,8 +254,9 @@ class KnownTags:
             self._diagnostics.doubted[f"{state}_tags"] = dict(zip(names, tags.values(), strict=True))
 
     def _rows_of_antennas(self, names: tuple[str, ...]) -> tuple[list[int], Integers, Integers]:
-        """Return the row of each antenna in ``names`` in a table of counts, or -1 for unknown and dead antennas. Also
-        return the antenna index and the number of rounds of each row of the table."""
+        """Return three values for a table of counts with one row for each antenna that is used. First: the row of each
+        antenna in ``names``, or -1 for unknown and dead antennas. Then: the antenna index and the number of rounds of
+        each row."""
         if names not in self._rounds:
             antennas = [self._antennas.get(name, -1) for name in names]
             antennas = [-1 if antenna in self._excluded else antenna for antenna in antennas]
@@ -261,8 +267,8 @@ class KnownTags:
         return self._rounds[names]
 
     def places(self, m: RfidScan) -> tuple[Integers, Integers]:
-        """Return the antenna index (R,) and the tag index (R,) of each of R reads in a scan. The index is -1 for
-        unknown antennas and tags, and for tags that are probably dead, weak or moved."""
+        """Return the antenna index (R,) and the tag index (R,) of each of the R reads in a scan. An antenna index is -1
+        if the antenna is unknown. A tag index is -1 if the tag is unknown, or probably dead, weak or moved."""
         antennas = np.array([self._antennas.get(name, -1) for name in m.antennas], dtype=np.int64)
         tags = np.array([self.map.index.get(name, -1) for name in m.tags], dtype=np.int64)
         tags[(tags >= 0) & (self.states.odds[tags] > 0.0)] = -1

@@ -39,8 +39,8 @@ class SilenceMonitor:
         self.lasts = False  # True if the reader or the tags had failed at the last scan
 
     def add(self, reads: int, evidence: float) -> bool:
-        """Add a scan. Returns True if the reader or all tags have failed. ``reads``: the number of reads in the scan.
-        ``evidence``: the log-probability of the scan at the predicted pose. It is summed since the last read."""
+        """Add a scan, and return True if the reader or all tags have failed. ``reads``: the number of reads in the
+        scan. ``evidence``: the log-probability of the scan at the predicted pose. It is summed since the last read."""
         self._evidence = 0.0 if reads else self._evidence + evidence
         self.lasts = self._evidence < -SILENT
         return self.lasts
@@ -132,8 +132,9 @@ class BurstMonitor:
         return ratio if ratio > INDEPENDENT else 1.0
 
     def add(self, t: float, measured: TagReadCounts, reads: ExpectedReads, counts: NDArray[np.bool_]) -> None:
-        """Add a scan at ``t`` [s]. Scans that are not later than all previous scans are ignored. ``measured``: the
-        scan. ``reads``: observed and expected reads of C tags. ``counts`` (C,): a mask of the tags to use."""
+        """Add a scan at ``t`` [s]. It is ignored if it is not later than the last added scan. ``measured``: the
+        antennas and rounds of the scan. ``reads``: observed and expected reads of C tags. ``counts`` (C,): a mask of
+        the tags to use."""
         if t <= self._last:
             return
         self._last = t
@@ -160,9 +161,9 @@ def _count(
     p: Array,
     counts: NDArray[np.bool_],
 ) -> None:
-    """Add the reads of C ``tags`` by K ``antennas`` to the ``cells`` of :class:`BurstMonitor`. ``rounds`` (K,): numbers
-    of rounds. ``hits`` (K, C): numbers of reads. ``p`` (K, C): the probability of a read in one round. ``counts`` (C,):
-    a mask of the tags to use."""
+    """Add the reads of C ``tags`` by K ``antennas`` to ``cells`` (tags, 2, antennas): the differences of observed and
+    expected reads, and their variances. ``rounds`` (K,): numbers of rounds. ``hits`` (K, C): numbers of reads. ``p``
+    (K, C): the probability of a read in one round. ``counts`` (C,): a mask of the tags to use."""
     for c in range(len(tags)):
         for k in range(len(antennas)):
             if counts[c] and p[k, c] > POSSIBLE:
@@ -172,8 +173,8 @@ def _count(
 
 @compiled
 def _taken(cells: Array, tags: Integers) -> tuple[float, float]:
-    """Return the sum of squared differences of observed and expected reads, and the sum of their variances, over the
-    cells of ``tags``. Also clear these ``cells`` of :class:`BurstMonitor`."""
+    """Return the sum of squared differences of observed and expected reads, and the sum of their variances, for the
+    indices ``tags``. Also set their elements of ``cells``, the table of :func:`_count`, to zero."""
     squares = variances = 0.0
     for t in tags:
         for a in range(cells.shape[2]):
@@ -250,10 +251,10 @@ class ConsistencyMonitor:
     def add(
         self, t: float, measured: TagReadCounts, reads: ExpectedReads, counts: NDArray[np.bool_], overdispersion: float
     ) -> None:
-        """Add a scan at ``t`` [s], and update ``doubted``. Scans that are not later than all previous scans are
-        ignored. ``measured``: the scan. ``reads``: observed and expected reads of C tags by K antennas. ``counts``
-        (K, C): a mask of the reads to use. ``overdispersion``: n correlated rounds have the information of n /
-        ``overdispersion`` rounds."""
+        """Add a scan at ``t`` [s], and update ``doubted``. It is ignored if it is not later than the last added scan.
+        ``measured``: the antennas and rounds of the scan. ``reads``: observed and expected reads of C tags by K
+        antennas. ``counts`` (K, C): a mask of the reads to use. ``overdispersion``: n correlated rounds have the
+        information of n / ``overdispersion`` rounds."""
         if t <= self._last:
             return
         forgotten = math.exp((self._last - t) / WINDOW)
@@ -266,8 +267,9 @@ class ConsistencyMonitor:
         self.doubted = chance < (TRUSTED if self.doubted else DOUBTED)
 
     def _chance(self, groups: slice, overdispersion: float) -> float:
-        """Return the p-value of the observed reads in ``groups`` if the model is correct. Returns 1 if the relative
-        error is at most DIFFERENT. ``overdispersion``: the number of correlated rounds that count as one."""
+        """Return the p-value of the observed reads if the model is correct, or 1 if the relative error is at most
+        DIFFERENT. ``groups``: the columns of :attr:`ReadGroups.sums` to test. ``overdispersion``: the number of
+        correlated rounds that count as one."""
         observed, predicted, variance = _merged(self._groups.sums[:, groups], FEWEST)
         off = observed - predicted
         if np.sum(np.abs(off)) <= DIFFERENT * np.sum(predicted):

@@ -76,8 +76,9 @@ class TagObservation:
         return frozenset(reads.read_tags.tolist()) if isinstance(reads, TagReadCounts) else frozenset()
 
     def at_its_time(self) -> Self | None:
-        """Return an observation that depends on the pose at its time ``t`` alone, or None for signal strengths and
-        phases. It has the detection models of the rig instead of estimated models."""
+        """Return an equivalent observation of the pose at the time ``t`` of the scan. The original may depend on an
+        earlier pose and the odometry since then. Returns None for signal strengths and phases. The result has the
+        detection models of the rig instead of estimated models."""
         likelihood = self.factor.likelihood
         if self.here is None or not isinstance(likelihood, RfidLikelihood):
             return None
@@ -226,12 +227,14 @@ class TagSensor(Sensor):
                 self._diagnostics.event(t, "doubted_model", DOUBTED_MODEL, shares=self._consistency.shares)
 
     def _values(self, view: View) -> dict[str, Array]:
-        """Return the estimated parameters (P,) of the detection models by state block, or {} if there are none."""
+        """Return the estimated parameters (P,) of the detection models as {name of the state block: parameters}. Return
+        {} if no parameters are estimated."""
         value = view.value(self.name) if self._blocks else None
         return {} if value is None else {self.name: value}
 
     def _estimated(self, view: View) -> Array:
-        """Return all parameters (Q,) of the read likelihood, with current values of the estimated parameters."""
+        """Return all parameters (Q,) of the read likelihood. Those that are estimated have their estimates in
+        ``view``."""
         out = self.tags.likelihood.parameters.copy()
         for value in self._values(view).values():
             out[list(self.constants.indices)] = value

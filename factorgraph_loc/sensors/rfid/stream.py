@@ -101,8 +101,8 @@ class RfidScan:
 class RfidStream(Stream):
     """All reads of a log, one per row. A round without reads has one row with an empty EPC.
 
-    ``t`` (N,): end of the inventory round [s]. Rows with equal ``t`` form a scan. ``round`` (N,): number of the round
-    in the scan. ``antenna``, ``epc``: N names. ``age`` (N,): time [s] from the read to ``t``. ``rssi`` (N,) [dBm],
+    ``t`` (N,): end of the inventory round [s]. Rows with equal ``t`` form a scan. ``round`` (N,): index of the round in
+    the scan. ``antenna``, ``epc``: N names. ``age`` (N,): time [s] from the read to ``t``. ``rssi`` (N,) [dBm],
     ``phase`` (N,) [rad], ``frequency`` (N,) [Hz]: NaN if unknown.
     """
 
@@ -245,9 +245,9 @@ def along_reference(
 ) -> tuple[RfidStream, Integers, Array, Array, Integers, Integers]:
     """Return the R reads of a log with known tag, antenna and reference pose, as six values.
 
-    They are the stream, the row numbers (R,) of the reads, their times (R,) [s], the robot's poses (R, 3), antenna
-    indices (R,), and tag indices (R,). ``tags``, ``antennas``: the index of each tag by EPC, and of each antenna by
-    name. Raises InputError if the log has no reference or no reads.
+    They are the stream, the row indices (R,) of the reads in it, and the times (R,) [s] of the reads. Then follow the
+    robot's poses (R, 3), antenna indices (R,), and tag indices (R,). ``tags``, ``antennas``: the index of each tag by
+    EPC, and of each antenna by name. Raises InputError if the log has no reference or no reads.
     """
     if log.reference is None:
         raise InputError(f"{log.name}: has no reference trajectory, which the calibration needs")
@@ -267,9 +267,9 @@ def phase_reads(
 ) -> PhaseReads:
     """Return the reads with a phase along the reference of a log, with poses in the world frame.
 
-    ``tags``, ``antennas``: see :func:`along_reference`. ``window``: the length [s] of the time windows. Phases are only
-    compared within a window. ``first_window``: the number of the first window. Raises InputError if the log has no
-    reference or no reads.
+    ``tags``, ``antennas``: the index of each tag by EPC, and of each antenna by name. ``window``: the length [s] of the
+    time windows. Phases are only compared within a window. ``first_window``: the index of the first window in the
+    result. Raises InputError if the log has no reference or no reads.
     """
     stream, rows, t, poses, antenna, tag = along_reference(log, tags, antennas)
     windows = first_window + np.floor((t - t.min(initial=np.inf)) / window).astype(np.int64)

@@ -209,9 +209,9 @@ def review(use: Use, ending: Ending) -> Review:
 
 
 def doubts(use: Use, diagnostics: Diagnostics, learnt: Learnt) -> Iterator[Notice]:
-    """Yield warnings after a run: reads that are not used, tags that are probably dead, weak or moved, and estimated
-    constants that differ from the rig. ``diagnostics``: of the causal estimates. ``learnt``: the estimated
-    constants."""
+    """Yield warnings after a run about reads that are not used, and about tags that are probably dead, weak or moved.
+    Yield warnings about estimated constants that differ from the rig. ``diagnostics``: the diagnostics of the causal
+    estimates. ``learnt``: the estimated constants."""
     log, rounds = use.log, diagnostics.ignored.get("rfid", 0)
     if rounds and use.estimator != "dead_reckoning":  # no warning, because dead reckoning uses only odometry
         ignored = "{log}: {estimator} does not use RFID: all {rounds} inventory rounds are ignored"
@@ -295,7 +295,7 @@ class _Trials:
     """M trials. A trial is one round of one antenna that may read one tag.
 
     ``p`` (M,): predicted probability of a read. ``hit`` (M,): 1 for a read, otherwise 0. ``antenna``, ``tag`` (M,):
-    indices of antenna and tag. ``block`` (M,): number of the time block. ``distance`` (M,): from antenna to tag [m].
+    indices of antenna and tag. ``block`` (M,): index of the time block. ``distance`` (M,): from antenna to tag [m].
     """
 
     p: Array
@@ -386,7 +386,8 @@ def _counted(log: str, trials: _Trials, antennas: list[str], tempering: float) -
 
 def _overdispersion(trials: _Trials, band: Integers) -> float:
     """Return the overdispersion (:func:`.overdispersion`) of ``trials``. The probabilities are scaled first, so that
-    they predict the number of reads in each distance interval. ``band`` (M,): the interval of each trial."""
+    they predict the number of reads in each distance interval. ``band`` (M,): the index of the interval of each
+    trial."""
     share = np.ones(int(band.max(initial=0)) + 1)
     predicted, observed = np.bincount(band, trials.p), np.bincount(band, trials.hit)
     np.divide(observed, predicted, out=share, where=predicted > 0.0)

@@ -24,7 +24,7 @@ OUTSIDE = -1  # the round of a read that is in no inventory
 
 
 def rounds_from_gaps(t_ns: Integers, antenna: Sequence[str], gap: float) -> Integers:
-    """Return the round (N,) of each of N reads, numbered from 0, if the log has no table of rounds.
+    """Return the index (N,) of the inventory round of each of N reads, from 0, if the log has no table of rounds.
 
     ``t_ns`` (N,), ``antenna`` (N): time [ns] and antenna of each read, in order of time. A round ends when another
     antenna reads a tag, or after ``gap`` [s] without a read. Rounds without reads cannot be detected.
@@ -61,8 +61,8 @@ def rounds_from_inventories(
 
 
 def ends_of(t_ns: Integers, number: Integers, gap: float) -> Integers:
-    """Return the end (R,) [ns] of R rounds from :func:`rounds_from_gaps`: the time of the next read, but at most
-    ``gap`` [s] after the last read of the round. ``t_ns``, ``number`` (N,): time [ns] and round of each read."""
+    """Return the end (R,) [ns] of R rounds from :func:`rounds_from_gaps`. It is the time of the next read, but at most
+    ``gap`` [s] after the last read of the round. ``t_ns``, ``number`` (N,): time [ns] and round index of each read."""
     last = np.flatnonzero(np.diff(number, append=number[-1:] + 1))
     following = np.append(t_ns, np.iinfo(np.int64).max)[last + 1]
     return np.asarray(np.minimum(t_ns[last] + round(gap * 1e9), following), dtype=np.int64)
@@ -195,8 +195,8 @@ def _named_rounds(reads: TableRows, end_ns: Integers, antenna: list[str]) -> Int
 
 
 def _rounds(reads: TableRows, rows: Integers, number: Integers, end_ns: Integers, antenna: list[str]) -> ReadsByRound:
-    """Return the reads in ``rows`` (N,) of the table ``reads``, assigned to the rounds ``number`` (N,). ``end_ns``
-    (R,), ``antenna`` (R): end [ns] and antenna of each round."""
+    """Return the reads in ``rows`` (N,) of the table ``reads``. ``number`` (N,): the index of the round of each read.
+    ``end_ns`` (R,), ``antenna`` (R): end [ns] and antenna of each round."""
     epc = [reads.names["epc"][i] for i in rows.tolist()]
     unknown = np.full(len(reads.t_ns), np.nan)
     rssi, phase, frequency = (reads.numbers.get(name, unknown)[rows] for name in SIGNALS)

@@ -38,9 +38,9 @@ def fit_grid(pairs: TagPairs, parametric: DetectionModel, smoothness: float, flo
     """Return a detection model on a grid, fitted to the reads and misses of ``pairs``. Far from data it is
     ``parametric``.
 
-    ``smoothness``: weight of squared second differences of logits. ``floor``: probabilities of false reads and misses.
-    The grid has an axis for height if the heights of ``pairs`` differ. It has an axis for the tag's facing if
-    ``parametric`` depends on it.
+    ``smoothness``: the weight of the squared second differences of logits. ``floor``: minimum probabilities of a read
+    and of a miss. The grid has an axis for height if the heights of ``pairs`` differ. It has an axis for the tag's
+    facing if ``parametric`` depends on it.
     """
     base = bake(parametric, EXTENT, CELL, _heights(pairs), FACINGS if parametric.uses_facing else 1)
     shape = (base.logits.shape[0], 1, *base.logits.shape[2:])

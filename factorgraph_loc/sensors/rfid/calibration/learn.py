@@ -179,9 +179,9 @@ def _mounted(
 def _mean(
     name: str, corrections: Sequence[tuple[float, float]], initial: float, value: float, prior: float
 ) -> FittedConstant | None:
-    """Return a constant that is the same in all logs, or None without corrections. Its value is ``value`` plus the mean
-    correction, or ``initial`` if the logs do not determine the constant. ``corrections``: a correction and its standard
-    deviation for each log. ``prior``: the standard deviation of the constant before the calibration."""
+    """Return a constant that is the same in all logs, or None if ``corrections`` is empty. Its value is ``value`` plus
+    the mean correction, or ``initial`` if the logs do not determine the constant. ``corrections``: a correction and its
+    standard deviation for each log. ``prior``: the standard deviation of the constant before the calibration."""
     if not corrections:
         return None
     each, errors = np.array(corrections).T
@@ -209,8 +209,9 @@ def _refitted(
 
 
 def _prior(traced: Sequence[Traced], labels: Sequence[str]) -> PriorSettings:
-    """Return the scatter between logs of the range and of the read rate of a detection model, as the model's prior. The
-    values of each log were estimated by the smoother. ``labels``: the names of both parameters in ``traced``."""
+    """Return the prior of a detection model: the standard deviations of its range and its read rate between logs. The
+    values of each log were estimated by the smoother. ``labels``: the names of both parameters in the constants of each
+    log in ``traced``."""
     scatters = {}
     for kind, label in zip(OF_MODEL, labels, strict=True):
         if corrections := corrections_of(f"rfid.{label}", traced):

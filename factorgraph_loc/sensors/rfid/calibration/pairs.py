@@ -24,10 +24,11 @@ class TagPairs:
     """M pairs of an antenna pose and a tag, with the number of reads. Detection models are fitted to them.
 
     ``points`` (M, 3): position of the tag in the antenna frame [m].
-    ``facing`` (M,): cosine of the angle between the direction of the tag's front and the direction to the antenna, or 0.
+    ``facing`` (M,): cosine of the angle between the direction of the tag's front and the direction to the antenna, or
+    0.
     ``count`` (M,): number of inventory rounds. ``hits`` (M,): number of rounds that read the tag.
     ``antenna``, ``tag`` (M,): index of the antenna in the rig, and of the tag among all logs.
-    ``fold`` (M,): number of the fold for cross-validation. ``block`` (M,): number of the time block.
+    ``fold`` (M,): index of the fold for cross-validation. ``block`` (M,): index of the time block.
     """
 
     points: Array
@@ -86,8 +87,8 @@ def pairs_of(
 
 
 def nearby(log: Rounds, settings: RfidSettings, survey: SurveySettings) -> Integers:
-    """Return the indices of all pairs of a round and a tag with a distance below :data:`REACH`. The pair of round k and
-    tag t of T tags has the index k T + t."""
+    """Return the indices (M,) of all pairs of a round and a tag with a distance below :data:`REACH`. The pair of round
+    k and tag t of T tags has the index k T + t. ``survey``: the transform of the tags to the world frame."""
     every = np.arange(log.hits.size)
     return every[view_of(log, settings, survey, every)[1] < REACH]
 
@@ -118,8 +119,8 @@ def view_of(log: Rounds, settings: RfidSettings, survey: SurveySettings, pairs: 
 
 @dataclass(frozen=True)
 class Floor:
-    """Bounds of the probability of a read. ``false_read``: its minimum at any position of the tag. ``miss``: the
-    minimum probability that a tag is not read."""
+    """The bounds of the probability of a read. ``false_read``: the minimum probability of a read, at any position of
+    the tag. ``miss``: the minimum probability that a tag is not read."""
 
     false_read: float = 0.02
     miss: float = 0.02

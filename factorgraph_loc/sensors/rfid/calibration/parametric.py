@@ -98,7 +98,8 @@ def logistic(pairs: TagPairs, *, with_facing: bool) -> Family:
 
 
 def beam(start: BeamModel) -> Family:
-    """Return the family of beam models with priors around ``start``. The parameter ``behind`` is fixed."""
+    """Return the family of beam models with priors around ``start``. The parameter ``behind`` (ratio of read
+    probabilities behind and in front of a tag) is not fitted, but taken from ``start``."""
     parameters = []
     for name, (low, high) in BEAM.items():
         mean = min(max(getattr(start, name), low), high)
@@ -107,7 +108,7 @@ def beam(start: BeamModel) -> Family:
 
 
 def scaled(start: GridModel) -> Family:
-    """Return the family of grids that differ from ``start`` only in range and read rate. See
+    """Return the family of grids that differ from ``start`` only in range and read rate. The parameters are those of
     :mod:`factors.rfid.parameters`."""
     peak = min(start.peak, MOST_CERTAIN)
 
@@ -169,8 +170,8 @@ def geometry_parameters(
 
 
 def kind_of(parameter: Parameter) -> tuple[str, str]:
-    """Return the kind of a parameter of :func:`geometry_parameters`, a key of SURVEY or COMMON, and the name of its
-    antenna. The antenna is "" for the survey."""
+    """Return the kind of a parameter of :func:`geometry_parameters`, such as "antennas.x", and the name of its antenna.
+    The antenna is "" for a parameter of the survey."""
     what, _, rest = parameter.name.partition(".")
     antenna, _, name = rest.rpartition(".")
     return f"{what}.{name}", antenna
@@ -225,8 +226,8 @@ def estimate_geometry(
 def with_changes(
     settings: RfidSettings, survey: SurveySettings, places: Sequence[Parameter], changes: Array
 ) -> tuple[RfidSettings, SurveySettings]:
-    """Return ``settings`` and ``survey`` with the values ``changes`` (P,) of the parameters ``places`` added. See
-    :func:`geometry_parameters`."""
+    """Return copies of ``settings`` and ``survey`` to which ``changes`` (P,) are added. ``places``: the P parameters
+    that change, from :func:`geometry_parameters`."""
     antennas = dict(settings.all_antennas())
     for place, change in zip(places, changes.tolist(), strict=True):
         antenna, name = kind_of(place)[1], place.name.rpartition(".")[2]
@@ -263,8 +264,9 @@ def pose_share(
 
 
 def _evidence(logit: Array, jacobian: Array, pairs: TagPairs, floor: Floor, block: Integers) -> LikelihoodTerms:
-    """Return the likelihood of ``pairs``. ``logit`` (M,): predicted logits of the read probability. ``jacobian``
-    (M, P): their derivatives by P parameters. ``block`` (M,): pairs with the same number are treated as correlated."""
+    """Return the likelihood of ``pairs``. ``logit`` (M,): predicted logits of the read probability. ``jacobian`` (M,
+    P): their derivatives by P parameters. ``block`` (M,): a group index of each pair. Pairs of one group are treated as
+    correlated."""
     likelihood = terms(logit, pairs.hits, pairs.count, floor)
     information = jacobian.T @ (likelihood.information[:, None] * jacobian)
     scores = by_block(likelihood.gradient[:, None] * jacobian, block)

@@ -34,8 +34,9 @@ class Rounds:
     """Inventory rounds of a log at K robot poses, and the T tags of the map that are read at least once.
 
     ``log``: the name of the log. ``t`` (K,): times [s]. ``poses`` (K, 3): robot poses. ``antenna`` (K,): the antenna of
-    the rounds, as index in the rig. ``count`` (K,): weighted number of rounds. ``hits`` (K, T): number of rounds that
-    read each tag, with the same weights. ``tags``: positions and facings in the survey frame. ``names``: T EPCs.
+    the rounds, as index in the rig. ``count`` (K,): the number of rounds, reduced if many rounds are merged. ``hits``
+    (K, T): the number of rounds that read each tag, reduced by the same factor. ``tags``: positions and facings in the
+    survey frame. ``names``: T EPCs.
     """
 
     log: str
@@ -54,7 +55,8 @@ class Rounds:
 
 
 def rounds_of(log: Log, settings: RfidSettings, *, merged: bool = True) -> Rounds:
-    """Return the inventory rounds of a log at reference poses. Tags and antennas that are unknown are omitted.
+    """Return the inventory rounds of a log at reference poses. Tags that are not in the map, and rounds of antennas
+    that are not in the rig, are omitted.
 
     ``merged``: True to merge rounds at nearly equal poses. The time of a round is the middle of its reads. Raises
     InputError if the log has too few rounds, or reads of too few tags.
@@ -101,8 +103,8 @@ def _middle(age: Array, inverse: Integers, read: NDArray[np.bool_], count: int) 
 
 
 def cells(coordinates: Array, sizes: tuple[float, ...]) -> tuple[Integers, Integers]:
-    """Return the index of the first point in each occupied cell of a grid, and the cell number (M,) of each point.
-    ``coordinates`` (M, D): the points. ``sizes`` (D,): the size of a cell."""
+    """Return the index (C,) of the first point in each of C occupied grid cells, and the cell (M,) of each point. Cells
+    are numbered from 0 to C - 1. ``coordinates`` (M, D): the points. ``sizes`` (D,): the size of a cell."""
     keys = np.floor(coordinates / sizes).astype(np.int64)
     keys -= keys.min(axis=0)
     flat = np.ravel_multi_index(tuple(keys.T), tuple(keys.max(axis=0) + 1))
@@ -119,7 +121,7 @@ def overdispersion(
     divided by its value for independent reads (McCullagh and Nelder, "Generalized linear models", 1989, section 4.5).
     If it is n, n correlated rounds have as much information as one independent round. ``hits``, ``count`` (M,): numbers
     of reads and of rounds. ``p`` (M,): predicted probability of a read in one round. ``antenna``, ``tag``, ``block``
-    (M,): their numbers.
+    (M,): indices of the antenna, the tag and the time block.
     """
     first, cell = cells(np.column_stack((block, tag, antenna)), (1.0, 1.0, 1.0))
     excess, variance = np.bincount(cell, hits - count * p), np.bincount(cell, count * p * (1.0 - p))

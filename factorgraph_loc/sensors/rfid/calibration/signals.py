@@ -117,7 +117,7 @@ class _Focus:
         return replace(self, reads=self._likelihood(state).near(self._pose(state), self.reads))
 
     def without(self, block: int) -> _Focus:
-        """Return a copy without the reads of the time block number ``block`` (jackknife)."""
+        """Return a copy without the reads of the time block with index ``block``. The jackknife uses it."""
         edges = np.linspace(0, int(self.reads.windows.max()) + 1, BLOCKS + 1)
         inside = (self.reads.windows >= edges[block]) & (self.reads.windows < edges[block + 1])
         return replace(self, reads=self.reads.chosen(~inside))
@@ -127,13 +127,14 @@ class _Focus:
         return 1.0 + float(self._likelihood(state).log_likelihood(self._pose(state)[None], self.reads)[0]) / self.count
 
     def coarse(self, origin: Array) -> Array:
-        """Return the best state (5,) on a grid of survey transforms around ``origin`` (5,), from some windows only."""
+        """Return the state (5,) of maximum agreement on a grid of survey transforms around ``origin`` (5,). Only some
+        time windows of phases are used, to save time."""
         some = replace(self, reads=self.reads.chosen(self.reads.windows % THINNING == 0))
         states = [origin + np.array((x, y, h, 0.0, 0.0)) for x, y, h in itertools.product(SHIFTS, SHIFTS, HEADINGS)]
         return max(states, key=some.agreement)
 
     def climb(self, state: Array) -> Array:
-        """Return the state (5,) of maximum agreement near ``state`` (5,)."""
+        """Return the local maximum (5,) of the agreement that is found by an optimizer from ``state`` (5,)."""
         # a heading of 0.3 rad has about the same effect as a shift of 1 m
         unit = np.array((1.0, 1.0, 0.3, 1.0, 1.0))
         result = scipy.optimize.minimize(
