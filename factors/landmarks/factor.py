@@ -41,9 +41,10 @@ LEAST_SINGULAR = 1e-6  # minimum singular value of a Jacobian by a landmark, in 
 
 @dataclass(frozen=True, slots=True)
 class BearingRangeFactor:
-    """A factor on the robot's pose from K landmarks measured at one time, or shortly after the time of the pose.
+    """A factor on the robot's pose from K landmarks, all measured at the time of the pose or all at one later time.
 
-    ``points``: world positions (K, 2) of the landmarks, or (K, 3) with their heights above the sensor.
+    ``model``: the sensor and its noise. ``points``: world positions (K, 2) of the landmarks, or (K, 3) with their
+    heights above the sensor.
     ``ranges``, ``bearings``: measurements (K,) [m, rad], NaN where a value is missing.
     ``offset`` (3,): the robot's pose at the time of the measurement in the frame of the estimated pose, from odometry.
     None if the two poses are equal.
@@ -106,7 +107,7 @@ class BearingRangeFactor:
 
     @property
     def packed(self) -> kernels.Sighting:
-        """The fields of the measurement as a tuple, the argument ``packed`` of compiled functions."""
+        """The measured values of the factor, without the sensor model, as a tuple for compiled functions."""
         offset, drift, twist, surveys = self.offset, self.offset_covariance, self.twist, self.point_covariances
         return (
             *(self.points, self.ranges, self.bearings),
@@ -148,15 +149,16 @@ class BearingRangeFactor:
         return self if late == self.model.late else replace(self, model=with_late(self.model, late))
 
     def predicted(self, pose: Array, covariance: Array) -> tuple[Array, Array, Array]:
-        """Return three arrays (K,): errors, slopes and variances of the ranges, as in
-        :meth:`~factors.landmarks.late.LateShares.updated`. ``pose`` (3,), ``covariance`` (3, 3): the prediction. The
-        factor must depend on the pose only."""
+        """Return three arrays (K,), from the predicted ``pose`` (3,) with ``covariance`` (3, 3). The first has the
+        predicted minus the measured ranges in standard deviations. The second has the inverse standard deviations
+        [1/m], or 0 for a landmark without range or with a bearing. The third has the variances of the predicted ranges,
+        divided by those of the noise. The factor must depend on the pose only."""
         contiguous = np.ascontiguousarray(covariance)
         return kernels.predicted(self.model.packed, self.packed, pose, contiguous)
 
     def resolved(self, values: Sequence[Array], covariance: Array) -> ResolvedFactor:
-        """Return a factor to use in a Kalman update. Gaussian measurements replace ranges that may be too long. It is
-        valid for one prediction: the ``values`` of the variables with the joint ``covariance`` (D, D)."""
+        """Return a factor to use in one Kalman update, with Gaussian measurements in place of ranges that may be too
+        long. It is valid only for the prediction ``values`` (see the class) with the joint ``covariance`` (D, D)."""
         error, blocks, slopes = self._linearized(values)
         jacobian, changed, weights = np.concatenate(blocks, axis=2), error.copy(), np.ones(len(error))
         columns, contiguous = np.arange(len(covariance)), np.ascontiguousarray(covariance)
@@ -171,8 +173,8 @@ class BearingRangeFactor:
         return self._linearized(values)[:2]
 
     def _linearized(self, values: Sequence[Array]) -> tuple[Array, list[Array], Array]:
-        """Return the results of :meth:`whitened` and, as a third value, those (K,) of
-        :func:`~factors.landmarks.losses.slopes`."""
+        """Return the results of :meth:`whitened` and, as a third value, the derivative (K,) [1/m] of each range
+        residual by the predicted range. It is 0 for a landmark without range or with a bearing."""
         error, jacobian = self._whitened(values)
         blocks, slopes = self._blocks(jacobian), np.empty(len(error))
         losses.slopes(error, jacobian, self._shortened(values), self.bearings, slopes)
@@ -257,7 +259,8 @@ class BearingRangeFactor:
 @dataclass(frozen=True)
 class ResolvedFactor:
     """A landmark ``factor`` for one Kalman update, with Gaussian measurements in place of ranges that may be too long.
-    ``shift`` (K,): is added to the whitened range residuals. ``root`` (K,): the square roots of the weights."""
+    ``shift`` (K,): is added to the whitened range residuals. ``root`` (K,): the square roots of the measurements'
+    weights."""
 
     factor: BearingRangeFactor
     shift: Array
@@ -287,13 +290,13 @@ def landmark_update(
     iterations: int,
     converged: float = CONVERGED,
 ) -> Correction | None:
-    """Correct the Gaussian estimate of a robot pose by landmarks of the map, with an iterated Kalman update. A compiled
-    equivalent of :func:`~factors.update.update_state`.
+    """Correct the Gaussian estimate of a robot pose by the landmarks of ``factor``, with an iterated Kalman update. A
+    compiled equivalent of :func:`~factors.update.update_state`.
 
     ``pose`` (3,): the predicted pose. ``covariance`` (S, S): the covariance of the error state. Its first three
     components are the pose. ``constants`` (P,): corrections of the estimated sensor constants. They are the components
-    of the error state from index ``first`` on. ``iterations``: their maximum number. They end earlier when a step is
-    below ``converged``. Returns None for a free landmark, a range bias or a numerically singular matrix. Call
+    of the error state from index ``first`` on. ``iterations``: the maximum number of iterations. They end earlier when
+    a step is below ``converged``. Returns None for a free landmark, a range bias or a numerically singular matrix. Call
     ``update_state`` then.
     """
     if factor.free or factor.biased:
@@ -356,8 +359,8 @@ class BearingRangeStack:
         return float(losses.loss(self._model, error, slopes))
 
     def _whitened(self, poses: Array, parameters: Array) -> tuple[Array, Array, Array]:
-        """Return the whitened residuals (K, 2) without robust weights, their Jacobian (K, 2, WIDTH), and the results
-        (K,) of :func:`~factors.landmarks.losses.slopes`."""
+        """Return the whitened residuals (K, 2) without robust weights, their Jacobian (K, 2, WIDTH), and the
+        derivatives (K,) of :func:`~factors.landmarks.losses.slopes`."""
         changes, count = np.zeros(len(PARAMETERS)), self.rows // 2
         changes[self._estimated] = parameters[self._column : self._column + len(self._estimated)]
         out = np.zeros((count, 2)), np.zeros((count, 2, WIDTH))

@@ -93,7 +93,7 @@ def linearize(model: Array, pose: Array, changes: Array, packed: Sighting, error
 def linearize_each(model: Array, poses: Array, points: Array, ranges: Array, bearings: Array) -> tuple[Array, Array]:
     """Return the whitened residuals (N, 2) of N landmark measurements, and their Jacobian (N, 2, WIDTH).
     ``poses`` (N, 3), ``points`` (N, 2) or (N, 3), ``ranges`` (N,), ``bearings`` (N,): the pose, the landmark and the
-    values of each measurement. ``model``: as in :func:`linearize`."""
+    values of each measurement. ``model`` (14,): the sensor, as in :func:`linearize`."""
     error, jacobian = np.zeros((len(poses), 2)), np.zeros((len(poses), 2, WIDTH))
     mounted, depth = (model[0], model[1], model[TURN]), model[DEPTH] > 0.0
     noise = model[3], model[RANGE_SIGMA], model[RELATIVE], model[2], model[BEARING_SIGMA]
@@ -135,8 +135,9 @@ def _carried(jacobian: Array, covariance: Array) -> tuple[float, float, float]:
 
 @compiled(error_model="numpy")
 def beyond(model: Array, pose: Array, packed: Sighting, covariance: Array, limit: float) -> int:
-    """Return the number of landmarks with a normalised innovation squared above ``limit``. ``model``, ``packed``: as in
-    :func:`linearize`. ``pose`` (3,), ``covariance`` (3, 3): the predicted pose and its body-frame covariance."""
+    """Return the number of landmarks with a normalised innovation squared above ``limit``. ``model`` (14,), ``packed``:
+    the sensor and the measurement, as in :func:`linearize`. ``pose`` (3,), ``covariance`` (3, 3): the predicted pose
+    and its body-frame covariance."""
     count = len(packed[0])
     error, by_pose, outliers = np.zeros((count, 2)), np.zeros((count, 2, WIDTH)), 0
     linearize(model, pose, np.zeros(TIME_OFFSET + 1), packed, error, by_pose)
@@ -206,11 +207,10 @@ def updated(
     measurement, see :data:`Sighting`. ``pose`` (3,), ``covariance`` (S, S): the prediction. The first three components
     of the error state are the pose. ``values`` (P,), ``indices`` (P,): corrections of the estimated sensor constants,
     and their indices in :data:`~factors.landmarks.model.PARAMETERS`. ``first``: the index of the first of these in the
-    error state.
+    error state. ``iterations``: their maximum number. They end earlier when a step is below ``converged``.
     ``gate``: the noise of a landmark is increased if its normalised innovation squared exceeds this limit.
     Returns the correction (S,), the new covariance (S, S), the whitened residuals (K, 2) of the prediction, the
-    normalised innovation squared, and the number of measured values. Raises LinAlgError if a covariance is singular.
-    """
+    normalised innovation squared, and the number of measured values. Raises LinAlgError if a covariance is singular."""
     count, size = len(packed[0]), len(covariance)
     columns = np.empty(3 + len(values), np.int64)
     for j in range(len(columns)):
@@ -256,7 +256,8 @@ def weighted(
     model: Array, packed: Sighting, pose: Array, values: Array, indices: Integers
 ) -> tuple[Array, Array, Array]:
     """Return the whitened residual (2K,) of K landmarks with robust weights, and its Jacobians by the pose (2K, 3) and
-    the estimated constants (2K, P). The arguments are those of :func:`updated`."""
+    the estimated constants (2K, P). ``model`` (14,), ``packed``: the sensor and the measurement. ``pose`` (3,): the
+    robot's pose. ``values``, ``indices`` (P,): corrections of the estimated constants, and their indices."""
     count, wide = len(packed[0]), len(indices)
     residual, jacobian, slope = np.empty((count, 2)), np.empty((count, 2, 3 + wide)), np.empty(count)
     _linearized(model, packed, pose, values, indices, residual, jacobian, slope)
@@ -267,9 +268,10 @@ def weighted(
 
 @compiled(error_model="numpy")
 def predicted(model: Array, packed: Sighting, pose: Array, covariance: Array) -> tuple[Array, Array, Array]:
-    """Return three arrays (K,) about the ranges in ``packed``, to detect late ranges: the whitened errors, their
-    derivatives by the range (:func:`slopes`), and the variances of the predicted ranges divided by the variance of the
-    noise. ``model``: as in :func:`linearize`. ``pose`` (3,), ``covariance`` (3, 3): the predicted robot pose."""
+    """Return three arrays (K,) about the ranges in ``packed``, to detect ranges that are too long. These are the
+    whitened errors, their derivatives by the range (:func:`slopes`), and the variances of the predicted ranges divided
+    by the variance of the noise. ``model`` (14,): the sensor. ``pose`` (3,), ``covariance`` (3, 3): the predicted robot
+    pose."""
     count = len(packed[0])
     error, jacobian, slope, variances = (
         np.zeros((count, 2)),
@@ -286,10 +288,10 @@ def predicted(model: Array, packed: Sighting, pose: Array, covariance: Array) ->
 
 @compiled(error_model="numpy")
 def innovations(model: Array, residual: Array, ranges: Array, bearings: Array) -> tuple[Array, Array]:
-    """Convert whitened residuals (K, 2), predicted minus measured, to innovations in metres and radians.
+    """Return the innovations of ranges [m] and bearings [rad], measured minus predicted, as two arrays.
 
-    ``model``: as in :func:`linearize`. ``ranges``, ``bearings`` (K,): measured, NaN if missing. Returns two arrays,
-    measured minus predicted ranges [m] and bearings [rad]. They are shorter than K if values are missing.
+    ``model`` (14,): the sensor, as in :func:`linearize`. ``residual`` (K, 2): the whitened residuals, predicted minus
+    measured. ``ranges``, ``bearings`` (K,): measured, NaN if missing. Missing values are left out of the results.
     """
     by_range, by_bearing = np.empty(len(ranges)), np.empty(len(ranges))
     r = b = 0
@@ -315,7 +317,7 @@ def _linearized(
     slope: Array,
 ) -> None:
     """Write the whitened ``residual`` (K, 2), its ``jacobian`` (K, 2, 3 + P) by the pose and the estimated constants,
-    and ``slope`` (K,) of :func:`slopes`. The remaining arguments are those of :func:`updated`."""
+    and the derivatives ``slope`` (K,) of :func:`slopes`. The remaining arguments are those of :func:`updated`."""
     count = len(residual)
     changes = np.zeros(len(PARAMETERS))
     for j in range(len(values)):

@@ -58,7 +58,8 @@ def mixture(
 
     ``error``: the predicted minus the measured range in standard deviations.
     ``slope``: the inverse of the standard deviation of a range [1/m].
-    ``robust``: the scale of the Geman-McClure loss. ``share``, ``mean``, ``sigma``: the fields of :class:`LateRanges`.
+    ``robust``: the scale of the Geman-McClure loss. ``share``: the fraction of late ranges.
+    ``mean``, ``sigma`` [m]: mean and standard deviation of the excess of a late range.
 
     The information is the mean information of a direct and a late range, minus the variance of the derivative (Louis,
     Journal of the Royal Statistical Society B 44(2), 1982). It has a positive minimum.
@@ -83,15 +84,17 @@ def mixture(
 def moments(
     error: float, slope: float, variance: float, robust: float, gate: float, share: float, mean: float, sigma: float
 ) -> tuple[float, float, float]:
-    """Replace a range that may be late (too long) by a Gaussian measurement with the same effect on a prediction.
+    """Return a Gaussian measurement that replaces a range that may be late (too long) in a Kalman update.
 
-    ``variance``: the variance of the predicted range divided by the variance of the noise. ``gate``: the noise is
-    increased if a normalised innovation squared exceeds this limit. The other arguments are those of :func:`mixture`.
+    ``error``: the predicted minus the measured range in standard deviations. ``slope``: the inverse of the standard
+    deviation of a range [1/m]. ``variance``: the variance of the predicted range divided by that of the noise.
+    ``robust``: the scale of the Geman-McClure loss. ``gate``: the noise is increased if a normalised innovation squared
+    exceeds this limit. ``share``, ``mean``, ``sigma``: the fields of :class:`LateRanges`.
 
-    Returns the error and the weight of the Gaussian measurement, and the expected normalised innovation squared. The
-    posterior of a range that may be late is a mixture of two Gaussians. The Gaussian measurement leads to a posterior
-    with the same mean and variance (assumed density filtering: Minka, "A family of algorithms for approximate Bayesian
-    inference", 2001, 3.1).
+    Returns three values: the error and the weight of the Gaussian measurement, and the expected normalised innovation
+    squared. The posterior of a range that may be late is a mixture of two Gaussians. The Gaussian measurement leads to
+    a posterior with the same mean and variance (assumed density filtering: Minka, "A family of algorithms for
+    approximate Bayesian inference", 2001, 3.1).
     """
     widening = 1.0 + (slope * sigma) ** 2
     beyond = error + slope * mean
@@ -159,11 +162,11 @@ class LateShares:
         return LateRanges(_rounded(share), _rounded(mean), _rounded(sigma)) if share >= LEAST else NONE
 
     def updated(self, errors: Array, slopes: Array, variances: Array) -> LateShares:
-        """Return the filter after K measured ranges.
+        """Return the Bayesian filter of late (too long) ranges after an update by K measured ranges.
 
         ``errors`` (K,): the predicted minus the measured ranges in standard deviations. ``slopes`` (K,): the inverse
-        standard deviations [1/m], 0 for measurements that cannot be late. ``variances`` (K,): the variances of the
-        predicted ranges, divided by the variance of the noise.
+        standard deviations of the ranges [1/m]. 0 excludes a measurement from the update, such as one with a bearing.
+        ``variances`` (K,): the variances of the predicted ranges, divided by the variances of the measured ranges.
         """
         if self.probability == 0.0 or not slopes.any():
             return self
@@ -180,9 +183,9 @@ def _rounded(value: float) -> float:
 def _learnt(
     logs: Array, shares: Array, means: Array, sigmas: Array, errors: Array, slopes: Array, variances: Array
 ) -> Array:
-    """Update the log-probabilities ``logs`` (noises, 1 + H) of all hypotheses by K ranges, and return them normalised.
-    ``shares``, ``means``, ``sigmas`` (H,): the hypotheses with late ranges. The other arguments are those of
-    :meth:`LateShares.updated`."""
+    """Return the normalised log-probabilities (noises, 1 + H) of all hypotheses after K measured ranges.
+    ``logs``: the same before. ``shares``, ``means``, ``sigmas`` (H,): the hypotheses with late (too long) ranges. The
+    other arguments are those of :meth:`LateShares.updated`."""
     out, late = logs.copy(), np.empty(_PARTS)
     for k in range(len(errors)):
         if slopes[k] == 0.0:
@@ -206,8 +209,9 @@ def _learnt(
 
 @compiled(error_model="numpy")
 def _averaged(logs: Array, shares: Array, means: Array, sigmas: Array) -> tuple[float, float, float]:
-    """Return the share of late ranges, and the mean and standard deviation [m] of their excess, averaged over all
-    hypotheses. The arguments are those of :func:`_learnt`."""
+    """Return the share of late (too long) ranges, and the mean and standard deviation [m] of their excess, averaged
+    over all hypotheses. ``logs`` (noises, 1 + H): their log-probabilities. ``shares``, ``means``, ``sigmas`` (H,):
+    their values."""
     share = first = second = 0.0
     for j in range(len(shares)):
         if shares[j] < 1.0:

@@ -25,8 +25,8 @@ def slopes(error: Array, jacobian: Array, ranges: Array, bearings: Array, out: A
 @compiled
 def loss(model: Array, error: Array, slopes: Array) -> float:
     """Return the sum of the robust losses of K landmarks. ``model`` (14,): the array ``packed`` of a
-    :class:`~factors.landmarks.model.BearingRangeModel`. ``error`` (K, 2): the whitened residuals. ``slopes`` (K,): the
-    output of :func:`slopes`."""
+    :class:`~factors.landmarks.model.BearingRangeModel`. ``error`` (K, 2): the whitened residuals. ``slopes`` (K,):
+    their derivatives by the predicted ranges [1/m], from :func:`slopes`."""
     total = 0.0
     for k in range(len(error)):
         if slopes[k] > 0.0 and model[LATE] > 0.0:
@@ -38,9 +38,9 @@ def loss(model: Array, error: Array, slopes: Array) -> float:
 
 @compiled
 def reweigh(model: Array, error: Array, slopes: Array, weights: Array) -> None:
-    """Write the weights of K squared residuals for iteratively reweighted least squares into ``weights`` (K,). The
-    ``error`` of a range that may be late (too long) changes in place. Weight times error is then the derivative of the
-    loss. The other arguments are those of :func:`loss`."""
+    """Write the weights of K squared residuals for iteratively reweighted least squares into ``weights`` (K,).
+    ``error`` (K, 2): the whitened residuals. A range residual changes in place if the range may be late (too long).
+    Weight times error is then the derivative of the loss. ``model``, ``slopes``: as in :func:`loss`."""
     for k in range(len(error)):
         if slopes[k] > 0.0 and model[LATE] > 0.0:
             late = model[ROBUST], model[LATE], model[LATE + 1], model[LATE + 2]
@@ -52,8 +52,9 @@ def reweigh(model: Array, error: Array, slopes: Array, weights: Array) -> None:
 
 @compiled
 def weigh(model: Array, error: Array, jacobian: Array, slopes: Array) -> None:
-    """Apply :func:`reweigh`. Then multiply the whitened residuals ``error`` (K, 2) and their ``jacobian`` (K, 2, D), in
-    place, by the square roots of the weights. The other arguments are those of :func:`loss`."""
+    """Multiply the whitened residuals ``error`` (K, 2) and their ``jacobian`` (K, 2, D), in place, by the square roots
+    of robust weights. The weights are those of :func:`reweigh`, which is applied first. ``model``, ``slopes``: as in
+    :func:`loss`."""
     weights = np.empty(len(error))
     reweigh(model, error, slopes, weights)
     for k in range(len(error)):
@@ -82,7 +83,7 @@ def resolve(
     ``error`` (K, 2), ``jacobian`` (K, 2, D): whitened residuals at the prediction, and their Jacobian. ``columns``
     (D,): the components of the state that the residuals depend on. ``covariance`` (S, S): covariance of the state.
     ``weights`` (K,): the weights of the squared residuals. ``squared`` (K,): the normalised innovations squared.
-    ``gate``: see :func:`factors.landmarks.late.moments`. ``model`` and ``slopes`` are those of :func:`loss`.
+    ``gate``: the limit of the latter, above which the noise is increased. ``model``, ``slopes``: as in :func:`loss`.
     """
     some = False
     for k in range(len(error)):

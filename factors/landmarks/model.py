@@ -149,7 +149,7 @@ def widened(model: BearingRangeModel, width: float) -> BearingRangeModel:
 
 @lru_cache(maxsize=64)
 def with_late(model: BearingRangeModel, late: LateRanges) -> BearingRangeModel:
-    """Return the model with the statistics ``late`` of ranges that are too long."""
+    """Return the model with other statistics ``late`` of ranges that are too long because of reflections."""
     return replace(model, late=late)
 
 
@@ -176,10 +176,11 @@ def whitened_into(
     error: Array,
     jacobian: Array,
 ) -> None:
-    """Compute the whitened residuals of :func:`residuals` at one pose, with their Jacobian.
+    """Write the whitened residuals of :func:`residuals` at one pose, with their Jacobian, into arrays.
 
     ``pose`` (3,): the robot's pose. ``mounting``, ``depth``, ``depth_axis``: as in :class:`BearingRangeModel`.
-    ``model``: range scale, range sigma, relative range sigma, bearing bias, bearing sigma.
+    ``model``: range scale, range sigma, relative range sigma, bearing bias, bearing sigma. ``points`` (K, 2) or (K, 3):
+    landmarks. ``ranges``, ``bearings`` (K,): measured, NaN if missing.
     ``error`` (K, 2): output, the residuals. Must contain zeros before the call.
     ``jacobian`` (K, 2, WIDTH): output, the derivatives by the body-frame perturbation of the pose, by the point, and by
     :data:`PARAMETERS`. The change of the range scale is relative. The derivative by the time offset stays zero, because
@@ -233,6 +234,7 @@ def _whitened(
 
     ``sx``, ``sy``, ``height``: the vector from the sensor to the point, along the robot's axes [m]. ``turn``: heading
     of the sensor in the robot frame. ``ahead_x``, ``ahead_y``: unit vector of the depth axis in the robot frame.
+    ``model``, ``depth``: as in :func:`whitened_into`.
 
     The results are the errors of range and bearing, the point's distance along the floor, the derivatives of the
     unscaled range by ``sx`` and ``sy``, the unscaled range, and the range's inverse standard deviation.
@@ -296,12 +298,13 @@ def _losses(
     covariances: Array,
     losses: Array,
 ) -> None:
-    """Compute the negative log-likelihoods of K landmarks at N poses.
+    """Write the negative log-likelihoods of K landmarks at N poses into ``losses`` (N, K), up to a constant per
+    landmark.
 
-    ``constants`` (N, 5): sensor constants for each pose. ``turn``: heading of the sensor in the robot frame. ``noise``:
-    range sigma, relative range sigma, bearing sigma. ``tails``: scale of the robust loss, then share, mean and sigma of
-    late ranges. ``covariances`` (K, 2, 2): of the points, added to the noise, or (0, 2, 2) for exact points.
-    ``losses`` (N, K): output, up to a constant for each landmark.
+    ``constants`` (N, 5): x, y, bearing bias, range scale and depth axis of the sensor for each pose. ``turn``: heading
+    of the sensor in the robot frame. ``noise``: range sigma, relative range sigma, bearing sigma. ``depth``: as in
+    :class:`BearingRangeModel`. ``tails``: scale of the robust loss, then share, mean and sigma of ranges that are too
+    long. ``covariances`` (K, 2, 2): of the points, added to the noise, or (0, 2, 2) for exact points.
     """
     robust, share, mean, sigma = tails
     range_sigma, range_sigma_relative, bearing_sigma = noise

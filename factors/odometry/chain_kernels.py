@@ -209,10 +209,13 @@ def _turn_by_gyro(rows: Array, knots: Array, i: int, constants: Array) -> None:
 
 @compiled
 def move(knot: Array, duration: float, lag: float, hold: float, slipping: float, out: Array) -> None:
-    """Predict the integrated state ``knot`` by ``duration`` seconds, and write the new state into ``out``.
+    """Write the integrated odometry state ``duration`` [s] after the state ``knot`` into ``out``. Both are arrays
+    (16,): the fields of :class:`~factors.motion.ChainState`, the velocity (3), the target velocity (3), and two
+    internal values.
 
-    The velocity converges to that of the last odometry row with the time constant ``lag`` [s], and continues for at
-    most ``hold`` seconds. The motion after that is unknown. If ``slipping`` is 1, all motion is unknown.
+    The velocity converges to the target velocity with the time constant ``lag`` [s], for at most ``hold`` [s]. After
+    that the pose is constant and the time is added to the field ``unknown`` of ``out``. If ``slipping`` is 1, the whole
+    duration is added to this field.
     """
     ux, uy, uw = knot[_UX], knot[_UY], knot[_UW]
     moving = min(duration, hold)

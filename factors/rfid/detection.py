@@ -146,7 +146,8 @@ class Score(NamedTuple):
 
     @classmethod
     def of_signals(cls, nll: Array, gradient: Array, information: Array) -> Score:
-        """Return the score of signal strengths or phases. ``expected`` is set to ``nll``, and ``variance`` to zero."""
+        """Return the score of signal strengths or phases, with the given fields. ``expected`` is ``nll``, ``variance``
+        zero."""
         return cls(nll, gradient, information, nll, np.zeros(len(nll)))
 
 
@@ -242,8 +243,8 @@ class RfidLikelihood:
     def displaced(
         self, poses: Array, counts: TagReadCounts, hypotheses: Array, margin: float, parameters: Array, odds: Array
     ) -> tuple[Integers, Array, NDArray[np.bool_]]:
-        """Compute the log-likelihood of S possible states of each tag, such as weak or moved. Returns the indices (U,)
-        of the evaluated tags, their log-likelihoods (U, S), and a mask (U,) of the tags that were read.
+        """Return the indices (U,) of tags, log-likelihoods (U, S) of S possible states of each tag, such as weak or
+        moved, and a mask (U,) of the tags that were read.
 
         ``poses`` (N, 3): possible robot poses. The likelihood is the mean over all poses.
         ``hypotheses`` (S, 4): the states, from :func:`factors.rfid.tag_states.hypotheses`.

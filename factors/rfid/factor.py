@@ -242,9 +242,10 @@ def _corrected(
     covariance: Array,
     iterations: int,
 ) -> tuple[Array, Array, float, int, float, float, float]:
-    """Compute :meth:`RfidFactor.correct`. Returns the correction (3 + P,), the covariance after it, the normalised
-    innovation squared and its degrees of freedom, the negative log-likelihood of the prediction minus its mean, its
-    variance, and the log-evidence."""
+    """Return the seven results of :meth:`RfidFactor.correct`, computed in compiled code: the correction (3 + P,), the
+    covariance after it, the normalised innovation squared and its degrees of freedom, the negative log-likelihood of
+    the prediction minus its mean, its variance, and the log-evidence. ``tags``, ``phase``, ``strength``: as in
+    :func:`_score`."""
     size = len(covariance)
     nll, gradient, information, expected, variance = _score(tags, phase, strength, pose, values)
     prior_information = inverse(covariance)
@@ -325,7 +326,7 @@ def _posterior(prior_information: Array, information: Array) -> tuple[Array, flo
 @compiled
 def _innovation(gradient: Array, information: Array, covariance: Array, tempering: float) -> tuple[float, int]:
     """Return the normalised innovation squared of a likelihood and its degrees of freedom. ``gradient`` (D,),
-    ``information`` (D, D): at the prediction with ``covariance`` (D, D)."""
+    ``information`` (D, D): tempered by ``tempering``, at the prediction with ``covariance`` (D, D)."""
     size, predicted, pull = (
         len(gradient),
         product(product(information, covariance), information),
@@ -354,7 +355,8 @@ def _innovation(gradient: Array, information: Array, covariance: Array, temperin
 
 @compiled(error_model="numpy")
 def _rank(information: Array) -> int:
-    """Count the eigenvalues above :data:`LEAST_INFORMATION`, as positive pivots (Sylvester's law of inertia)."""
+    """Return the number of eigenvalues above :data:`LEAST_INFORMATION`, as positive pivots (Sylvester's law of
+    inertia)."""
     size, left, count = len(information), information.copy(), 0
     for k in range(size):
         left[k, k] -= LEAST_INFORMATION

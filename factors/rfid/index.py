@@ -55,8 +55,8 @@ def tag_index(points: Array) -> TagIndex:
 
 @compiled(inline="always")
 def cells(index: TagIndex, low: float, high: float, axis: int, count: int) -> tuple[int, int]:
-    """Return the first and last cell along an axis (0 for x, 1 for y) that the interval from ``low`` to ``high`` [m]
-    touches. ``count``: number of cells along the axis. Returns (0, -1) if the interval touches none."""
+    """Return the indices of the first and last cell along an axis (0 for x, 1 for y) that the interval from ``low`` to
+    ``high`` [m] touches. ``count``: number of cells along the axis. Returns (0, -1) if the interval touches none."""
     first = (low - index.corner[axis]) / index.cell
     last = (high - index.corner[axis]) / index.cell
     if not (first < count and last >= 0.0):
@@ -95,8 +95,9 @@ class MapTags(NamedTuple):
 
 
 class NearTags(NamedTuple):
-    """The C tags that are near some poses or listed in the reads. ``tags`` (C,): indices in the map, ascending. The
-    other fields are those of :class:`MapTags` and :class:`~factors.rfid.detection.TagReadCounts` for these tags."""
+    """The C tags that are near some poses or listed in the reads. ``tags`` (C,): indices in the map, ascending.
+    ``points`` (C, 3), ``normals`` (C, 2): positions and unit vectors of the fronts. ``hits`` (K, C): numbers of reads.
+    ``odds``, ``elsewhere`` (C,): as in :class:`~factors.rfid.detection.TagReadCounts`."""
 
     tags: Integers
     points: Array
@@ -120,8 +121,9 @@ def _box(poses: Array, reach: float) -> tuple[Corner, Corner]:
 
 @compiled
 def near_tags(of_map: MapTags, counts: Counts, poses: Array, reach: float) -> NearTags:
-    """Return the tags that may change the likelihood of poses (N, 3): at least all tags within ``reach`` [m] of any
-    pose, and the tags listed in ``counts`` (:attr:`factors.rfid.detection.TagReadCounts.packed`)."""
+    """Return the tags of a map that may change the likelihood of poses (N, 3), ascending. These are the tags listed in
+    ``counts`` (:attr:`factors.rfid.detection.TagReadCounts.packed`), all tags within ``reach`` [m] of any pose, and
+    some beyond."""
     _, _, _, hits, odds, elsewhere, listed, unlisted_odds, _ = counts
     low, high = _box(poses, reach)
     tags = union(within(of_map.cells, low, high), listed)
@@ -182,9 +184,10 @@ def union(first: Integers, second: Integers) -> Integers:
 def listing(
     listed: Integers, hits: Integers, odds: Array, elsewhere: Array, unlisted_odds: float, tags: Integers
 ) -> tuple[Integers, Array, Array]:
-    """Return the hits (K, U), odds (U,) and elsewhere (U,) of ``tags`` (U,), from the values of the C ``listed`` tags:
-    ``hits`` (K, C), ``odds`` (C,), ``elsewhere`` (C,). Both arrays of tags are ascending. A tag that is not listed has
-    0 hits, ``unlisted_odds``, and 0 for elsewhere."""
+    """Return ``hits`` (K, U), ``odds`` (U,) and ``elsewhere`` (U,) of ``tags`` (U,), fields of a
+    :class:`~factors.rfid.detection.TagReadCounts`. The arguments ``hits`` (K, C), ``odds`` (C,), ``elsewhere`` (C,) are
+    those of the ``listed`` tags (C,). Both arrays of tags are ascending. A tag that is not listed has 0 hits,
+    ``unlisted_odds``, and 0 for elsewhere."""
     new_hits = np.zeros((len(hits), len(tags)), np.int64)
     new_odds, new_elsewhere = np.full(len(tags), unlisted_odds), np.zeros(len(tags))
     i = 0

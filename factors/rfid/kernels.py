@@ -27,9 +27,9 @@ MOST_COLUMNS = 8  # largest number of components of pose and parameters that one
 def tag_logit(
     packed: Packed, antenna: int, p: float, q: float, height: float, c: float
 ) -> tuple[float, float, float, float, float]:
-    """Return the logit of a tag at (p, q, height) [m] from the antenna, and its derivatives by p, q, height and c. The
-    axes have the antenna's yaw but no pitch. ``c``: the cosine of the angle between the tag's front and the direction
-    to the antenna."""
+    """Return the logit of the read probability of a tag at (p, q, height) [m] from the antenna, and its derivatives by
+    p, q, height and c. The axes have the antenna's yaw but no pitch. ``c``: the cosine of the angle between the tag's
+    front and the direction to the antenna."""
     cp, sp = packed.antennas[antenna, 5], packed.antennas[antenna, 6]
     m = packed.which[antenna]
     x, z = cp * p + sp * height, cp * height - sp * p
@@ -81,14 +81,15 @@ def detection(packed: Packed, z: float, rate: float) -> tuple[float, float, floa
 def mixture(
     odds: float, elsewhere: float, e: float, mean: float, variance: float, none: float, tempering: float
 ) -> tuple[float, float, float, float]:
-    """Compute the likelihood of a tag that may be weak, moved or dead (:mod:`factors.rfid.tag_states`).
+    """Return four values about a tag that may be weak, moved or dead. The first is the factor that multiplies the
+    derivatives of ``e``. The other three are the tempered negative log-likelihood, its mean, and its variance.
 
-    ``odds``, ``elsewhere``: of :class:`~factors.rfid.detection.TagReadCounts`. ``e``, ``mean``, ``variance``: the
-    untempered negative log-likelihood of a tag that is as in the map, and its mean and variance over all outcomes.
-    ``none``: the untempered negative log-likelihood that a tag out of range is never read.
+    ``odds``: the prior log-odds that the tag is weak, moved or dead. ``elsewhere``: the tempered log-likelihood of its
+    reads if it is, minus that of a tag out of reach that is never read. ``e``, ``mean``, ``variance``: the untempered
+    negative log-likelihood of a tag that is as in the map, and its mean and variance over all outcomes.
+    ``none``: the untempered negative log-likelihood that a tag out of reach is never read. ``tempering``: the exponent.
 
-    Returns four values: the factor that multiplies the derivatives of ``e``, the tempered negative log-likelihood, its
-    mean, and its variance. The loss of information by the unknown state (Louis, JRSS B 44(2), 1982) is neglected.
+    The loss of information by the unknown state (Louis, JRSS B 44(2), 1982) is neglected.
     """
     if odds == -np.inf or elsewhere == -np.inf:
         return tempering, tempering * e, tempering * mean, tempering * variance
@@ -144,7 +145,8 @@ def _add_tag(
     Writes, for each measurement, the derivative ``slope`` (K,) by the read probability and the Fisher information
     ``curve`` (K,) on that probability, both 0 out of reach. Writes the derivatives ``by`` (K, 7) of the read
     probability by the antenna's position in the frame of the pose (2), its yaw, the parameters ``a`` and ``b`` of its
-    model, and the tag's position in the world (2). ``at``, ``far``: from :func:`place_measurements`, :func:`_unread`.
+    model, and the tag's position in the world (2). ``at`` (K, 8): poses of the antennas, from
+    :func:`place_measurements`. ``far`` (K, 3): the values of a tag out of reach, from :func:`_unread`.
     """
     nll = mean = variance = 0.0
     for k in range(len(antennas)):
@@ -225,8 +227,9 @@ def _add_measurement(
 def scores(
     packed: Packed, of_map: MapTags, counts: Counts, tempering: float, poses: Array, columns: Integers
 ) -> tuple[Array, Array, Array, Array, Array]:
-    """Return the fields of a :class:`~factors.rfid.detection.Score` at poses (N, 3). ``packed``: models with parameters
-    applied. ``columns`` (Q,): the component of each parameter in the gradient, -1 if it is not estimated."""
+    """Return ``nll`` (N,), ``gradient``, ``information``, ``expected`` (N,) and ``variance`` (N,) of read ``counts`` at
+    poses (N, 3), see :class:`~factors.rfid.detection.Score`. ``packed``: models with parameters applied. ``tempering``:
+    the exponent. ``columns`` (Q,): the component of each parameter in the gradient, -1 if it is not estimated."""
     antennas, rounds, twists = counts[1], counts[2], counts[8]
     offsets = delayed(counts[0], twists, packed.delay)
     count, scans, size = len(poses), len(antennas), 3
@@ -311,7 +314,7 @@ def by_tag(
 ) -> tuple[Array, Array, Array]:
     """Return the untempered negative log-likelihood (T,) of each of T tags that are as in the map, at one pose (3,).
     Also returns its gradient (T, 5) and Fisher information (T, 5, 5) by the pose (3) and the tag's world position (2).
-    ``offsets``, ``antennas``, ``rounds``, ``hits``: of :class:`~factors.rfid.detection.TagReadCounts`."""
+    ``offsets`` (K, 3), ``antennas``, ``rounds`` (K,), ``hits`` (K, T): the data of K measurements."""
     scans, tags, size = len(antennas), len(points), 5
     nll, gradient, information = np.empty(tags), np.zeros((tags, size)), np.zeros((tags, size, size))
     at, far, by = np.empty((scans, ROW)), _unread(packed, rounds), np.empty((scans, PLACE))

@@ -12,9 +12,9 @@ Place = TypeVar("Place", float, Array)
 
 
 def linear(place: Array, count: int) -> tuple[Integers, Array]:
-    """Compute a linear interpolation between ``count`` knots at positions 0 ... ``count`` - 1. ``place`` (N,): the
-    positions of the N results, clipped to this range. Returns the indices (N, 2) of the neighbouring knots and their
-    weights (N, 2), or (N, 1) if ``count`` is 1."""
+    """Return the indices (N, 2) of neighbouring knots and their weights (N, 2), for linear interpolation. If ``count``
+    is 1, both are (N, 1). ``count``: number of knots, at positions 0 ... ``count`` - 1. ``place`` (N,): the positions
+    of the N results, clipped to this range."""
     if count == 1:
         return np.zeros((len(place), 1), dtype=np.int64), np.ones((len(place), 1))
     below = np.clip(np.floor(place).astype(np.int64), 0, count - 2)
@@ -35,8 +35,9 @@ def cubic_weights(f: Place) -> tuple[Place, Place, Place, Place]:
 
 
 def cubic(place: Array, count: int) -> tuple[Integers, Array]:
-    """Interpolate by cubic convolution, with the arguments of :func:`linear` (Keys, IEEE TASSP 29(6), 1981, eq. 4, 6).
-    Returns the indices (N, 4) of the neighbouring knots and their weights (N, 4), or (N, 1) if ``count`` is 1."""
+    """Return the indices (N, 4) of neighbouring knots and their weights (N, 4), for cubic convolution (Keys, IEEE TASSP
+    29(6), 1981, eq. 4, 6). If ``count`` is 1, both are (N, 1). ``count``: number of knots, at positions 0 ... ``count``
+    - 1. ``place`` (N,): the positions of the N results, clipped to this range."""
     if count == 1:
         return np.zeros((len(place), 1), dtype=np.int64), np.ones((len(place), 1))
     below = np.clip(np.floor(place).astype(np.int64), 0, count - 2)

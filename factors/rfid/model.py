@@ -43,7 +43,7 @@ class DetectionModel(Protocol):
         """The largest read probability of the model."""
 
     def compiled(self) -> tuple[int, Sequence[float], Array]:
-        """Return the model for compiled code: kind, parameters, and the logits (H, F, NX, NY) of a grid, or empty."""
+        """Return the model for compiled code: kind, parameters, and grid of logits (H, F, NX, NY) or an empty array."""
 
 
 @dataclass(frozen=True)
@@ -83,9 +83,9 @@ class BeamModel:
 @dataclass(frozen=True)
 class LogisticModel:
     """A detection model with a logit linear in :data:`FEATURES` up to the distance ``reach`` [m]. ``coefficients``
-    (11,): one for each feature. The features depend on the horizontal distance r [m], w = 1 - cosine of the bearing,
-    the height difference z [m], and c. c is the cosine of the angle between the tag's front and the direction to the
-    antenna."""
+    (11,): one for each feature. They depend on the horizontal distance r [m], the height difference z [m], and w, which
+    is 1 - cosine of the bearing. They also depend on c, the cosine of the angle between the tag's front and the
+    direction to the antenna."""
 
     coefficients: Sequence[float]
     reach: float = 8.0
@@ -156,8 +156,8 @@ class Packed(NamedTuple):
     """A :class:`RfidModel` for compiled code. ``antennas`` (A, 7): x, y, z, cosine and sine of yaw, and of pitch.
     ``which`` (A,): the index of each antenna's model. ``kinds`` (M,), ``parameters`` (M, 12), ``reach`` (M,) [m]: of M
     models. ``knots``: the logits of all grids. ``shapes`` (M, 5): H, F, NX, NY and first index in ``knots`` of a grid.
-    ``scale``, ``rate`` (M,), ``delay`` (1,) [s]: see :mod:`factors.rfid.parameters`. ``peak`` (M,): the largest read
-    probabilities. ``span``: one minus the probabilities of false reads and misses."""
+    ``scale``, ``rate`` (M,), ``delay`` (1,) [s]: see :mod:`factors.rfid.parameters`. ``peak`` (M,): largest read
+    probability. ``span``: 1 - false read - miss probability. ``fixed``: True if the tags are on the robot."""
 
     antennas: Array
     which: NDArray[np.int64]
@@ -225,8 +225,8 @@ def _probability(logit: float) -> float:
 
 
 def logits(model: DetectionModel, points: Array, facing: Array | float = 0.0) -> tuple[Array, Array]:
-    """Return the logits (N,) of tags at ``points`` (N, 3) [m] in the antenna's frame, and their gradient (N, 4) by x,
-    y, z, facing. ``facing`` (N,): the cosine of the angle between each tag's front and the direction to the antenna."""
+    """Return the logits (N,) of read probabilities of tags at ``points`` (N, 3) [m] in the antenna's frame, and their
+    gradient (N, 4) by points and ``facing`` (N,): cosines between tags' fronts and directions to the antenna."""
     packed = RfidModel((Antenna(),), (model,)).packed()
     points = np.atleast_2d(np.asarray(points, dtype=float))
     facing = np.ascontiguousarray(np.broadcast_to(np.asarray(facing, dtype=float), len(points)))
@@ -273,8 +273,8 @@ def _logits(
 def logit(
     kind: int, parameters: Array, shape: NDArray[np.int64], knots: Array, x: float, y: float, z: float, c: float
 ) -> tuple[float, float, float, float, float]:
-    """Return the logit of a tag at (x, y, z) in the antenna's frame, and its four derivatives by x, y, z and c. ``c``:
-    the cosine of the angle between the tag's front and the direction to the antenna."""
+    """Return the logit of a tag's read probability at (x, y, z) in the antenna's frame, and its derivatives by x, y, z
+    and c. ``c``: the cosine of the angle between the tag's front and the direction to the antenna."""
     if kind == BEAM:
         return _beam(parameters, x, y, z, c)
     if kind == LOGISTIC:

@@ -16,8 +16,8 @@ ANYWHERE = 1e9  # m; a distance that contains all tags, because tags on the robo
 
 @compiled(inline="always")
 def placed(packed: Packed, antenna: int, pose: Array, offset: Array) -> tuple[float, float, float, float]:
-    """Return x, y, and the cosine and sine of the heading of an antenna in the frame of the tags: the world, or the
-    robot if the tags are on it. The robot is at ``offset`` (3,) in the frame of ``pose`` (3,)."""
+    """Return x, y, and the cosine and sine of the heading of one ``antenna`` (an index) in the frame of the tags: the
+    world, or the robot if the tags are on it. The robot is at ``offset`` (3,) in the frame of ``pose`` (3,)."""
     c0, s0 = math.cos(pose[2]), math.sin(pose[2])
     x, y = pose[0] + c0 * offset[0] - s0 * offset[1], pose[1] + s0 * offset[0] + c0 * offset[1]
     c, s = math.cos(pose[2] + offset[2]), math.sin(pose[2] + offset[2])

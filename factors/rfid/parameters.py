@@ -27,8 +27,8 @@ MOST_CERTAIN = 0.99  # limit of the peak of a model, because a shift of the logi
 
 @compiled
 def rate_of(peak: float, shift: float) -> float:
-    """Return the factor of read probabilities that shifts the logit of the model's largest probability ``peak`` by
-    ``shift``. The shift is the parameter b of a detection model."""
+    """Return the factor of a model's read probabilities that shifts the logit of the largest one, ``peak``, by
+    ``shift``. The shift is the parameter b of a detection model, see :mod:`factors.rfid.parameters`."""
     certain = min(peak, MOST_CERTAIN)
     return float(1.0 / (certain + (1.0 - certain) * math.exp(-shift)))
 

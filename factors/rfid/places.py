@@ -71,9 +71,10 @@ class Scan(NamedTuple):
     """The reads for one evaluation of the likelihood. W tags are listed: they were read or have unusual odds.
 
     ``antennas`` (K,), ``rounds`` (K,): antenna and number of rounds of each measurement. ``hits`` (K, W): the number of
-    reads of each listed tag. ``number`` (T,): for each tag of the map, in the order of the spatial index, its number
-    among the listed tags, or -1. ``odds`` (W,), ``elsewhere`` (W,), ``unlisted_odds``: as in
-    :class:`~factors.rfid.detection.TagReadCounts`.
+    reads of each listed tag. ``number`` (T,): for each tag of the map, in the order of the spatial index, its index
+    among the listed tags, or -1. ``odds`` (W,): the prior log-odds that a listed tag is weak, moved or dead.
+    ``elsewhere`` (W,): the log-likelihood of its reads if so. ``unlisted_odds``: the odds of all tags that are not
+    listed.
     """
 
     antennas: Integers
@@ -235,8 +236,8 @@ def _log_likelihood(
 ) -> None:
     """Add the tempered log-likelihood of poses (N, 3), relative to poses without tags in reach, to ``out`` (N,).
 
-    ``points`` (T, 3), ``normals`` (T, 2), ``levels`` (A, T): fields of :class:`Places`. ``missed``: the table of
-    misses.
+    ``points`` (T, 3), ``normals`` (T, 2), ``levels`` (A, T): fields of :class:`Places`, like ``index`` and ``tables``.
+    ``model``: the field ``antennas``. ``missed``: the table of misses. ``scan``: the reads.
     """
     far, tabled, reach = _far(tables, scan, tempering), tables.gain.size > 0, model.reach
     rows, base, size = (len(index.start) - 1) // index.columns, far.sum(), missed.surveyed.shape[1]

@@ -92,7 +92,7 @@ class PhaseReads(TagReads):
 
     @cached_property
     def ordered(self) -> _Ordered:
-        """The reads sorted by group, for compiled code."""
+        """The reads sorted by group (antenna, tag, channel, window), as arrays for compiled code."""
         order = np.argsort(self.groups, kind="stable")
         counts = np.bincount(self.groups)
         return _Ordered(
@@ -119,7 +119,7 @@ class _Ordered(NamedTuple):
 
 class PhaseProblem(NamedTuple):
     """Phase reads, map and model as arrays for compiled code. ``antennas`` (A, 6): the result of :func:`mounting`.
-    ``points`` (T, 3): positions of the tags. ``weight``: the tempering exponent times the concentration kappa."""
+    ``points`` (T, 3): tag positions. ``reads``: by group. ``weight``: tempering exponent times concentration kappa."""
 
     antennas: Array
     points: Array
@@ -182,8 +182,9 @@ class PhaseLikelihood:
         return mounting(self.model.antennas)
 
     def near(self, pose: Array, reads: PhaseReads) -> PhaseReads:
-        """Return the reads of tags within ``max_range`` of a robot at ``pose`` (3,), in groups of ``min_reads`` or
-        more. Call this once per window. A selection for each pose would make the likelihood discontinuous."""
+        """Return the reads of tags within the model's ``max_range`` of a robot at ``pose`` (3,), in groups of
+        ``min_reads`` or more. Call this once per window. A selection for each pose would make the likelihood
+        discontinuous."""
         at = se2.compose(np.asarray(pose, dtype=float), reads.offsets)
         places = self._antennas[reads.antennas]
         points = self.tags.points[reads.tags]
@@ -206,8 +207,8 @@ class PhaseLikelihood:
 
 @dataclass(frozen=True, eq=False)
 class RssiLikelihood:
-    """The likelihood of signal strengths as a function of the robot's pose in a map of tags. It is relative to
-    residuals of zero."""
+    """The likelihood of signal strengths by ``model`` as a function of the robot's pose in a map of ``tags``. Each read
+    with a residual of zero has a log-likelihood of zero."""
 
     model: RssiModel
     tags: TagArray

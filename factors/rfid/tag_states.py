@@ -210,7 +210,8 @@ def displaced(
     tempering: float,
     parameters: Array,
 ) -> tuple[Integers, Array, NDArray[np.bool_]]:
-    """Compute the results of :meth:`factors.rfid.detection.RfidLikelihood.displaced` in compiled code."""
+    """Return the indices (U,) of tags, the log-likelihoods (U, S) of their states, and a mask (U,) of the tags that
+    were read. See :meth:`factors.rfid.detection.RfidLikelihood.displaced`."""
     placed = adjusted(packed, parameters)
     measured = delayed(counts[0], counts[8], placed.delay), counts[1], counts[2]
     reach = margin + reach_of(placed, measured[0])

@@ -90,8 +90,9 @@ def log_likelihood(
 
 @compiled
 def mixed(own: float, odds: float, elsewhere: float) -> float:
-    """Return the log-likelihood of a tag that may be weak, moved or dead. ``own``: the log-likelihood if it is none of
-    these. ``odds``, ``elsewhere``: of :class:`~factors.rfid.detection.TagReadCounts`."""
+    """Return the tempered log-likelihood of a tag that may be weak, moved or dead. It is relative to that of a tag out
+    of reach that is never read, like ``own`` and ``elsewhere``. ``own``: the log-likelihood if the tag is as in the
+    map. ``elsewhere``: the log-likelihood if it is weak, moved or dead. ``odds``: the prior log-odds of the latter."""
     if odds == -np.inf or elsewhere == -np.inf:
         return own
     displaced = odds + elsewhere
@@ -103,8 +104,8 @@ def mixed(own: float, odds: float, elsewhere: float) -> float:
 
 @compiled
 def tags_of_tables(tables: Tables, near: NearTags) -> Tags:
-    """Return the data of C near tags for :func:`weigh_tag`: points (C, 3), normals (C, 2), the numbers (A, C) of the
-    tables of each antenna and tag, and the numbers of reads (K, C)."""
+    """Return four arrays about C tags, the argument ``tags`` of :func:`weigh_tag`: points (C, 3), normals (C, 2), the
+    numbers (A, C) of the tables of each antenna and tag, and the numbers of reads (K, C)."""
     levels = np.empty((len(tables.level), len(near.tags)), np.int64)
     for a in range(len(levels)):
         for u in range(len(near.tags)):
