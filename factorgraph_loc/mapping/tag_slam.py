@@ -127,9 +127,9 @@ def tag_observations(log: Log, height: float | None = None) -> TagObservations:
 def _rows(
     m: RfidScan, antennas: dict[str, int], index: dict[str, int]
 ) -> list[tuple[float, int, int, NDArray[np.int64]]]:
-    """Return (time [s], antenna, rounds, reads) per antenna that measured in the scan ``m``: the index of the antenna,
-    its number of rounds, and the number of rounds (T,) that read each tag. ``antennas``, ``index``: the indices of
-    antennas and of T tags by name."""
+    """Return (time [s], antenna, rounds, reads) per antenna that measured in the scan ``m``. ``antenna``: its index.
+    ``rounds``: its number of inventory rounds. ``reads`` (T,): how many of these read each tag. ``antennas``,
+    ``index``: the indices of antennas and of T tags by name."""
     places = [antennas.get(name, -1) for name in m.antennas]
     out = {a: (m.t, a, places.count(a), np.zeros(len(index), dtype=np.int64)) for a in sorted(set(places) - {-1})}
     # a tag counts once per round, even if it answers several times

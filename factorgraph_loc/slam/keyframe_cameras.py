@@ -52,13 +52,13 @@ def bundled(
     poses: Sequence[Array],
     waiting: Waiting,
 ) -> list[tuple[Array, Array]] | None:
-    """Return a list of (pose (3,), tilt (2,)), one per adjusted keyframe, from a bundle adjustment of keyframes and
-    points.
+    """Return (pose (3,), tilt (2,)) of each adjusted keyframe, from a bundle adjustment of keyframes and points. A tilt
+    is roll and pitch [rad].
 
-    ``keyframes``: consecutive keyframes. The newest keyframes are adjusted, as long as each shares enough points with
-    its predecessor. The first adjusted pose is fixed. ``poses``: the initial poses of all ``keyframes``. ``waiting``:
-    the observations of each point. A tilt is roll and pitch [rad]. Returns None if there are fewer than :data:`ENOUGH`
-    points, or if most observations of a keyframe do not fit.
+    ``keyframes``: consecutive keyframes. The newest ones are adjusted, back to the first that shares too few points
+    with its predecessor, whose pose is fixed. ``poses``: the initial poses of all ``keyframes``. ``waiting``: the
+    observations of each point, by its name. Returns None if there are fewer than :data:`ENOUGH` points, or if most
+    observations of a keyframe do not fit.
     """
     often = _seen_often(keyframes[0].index, waiting)
     shared, sees = np.zeros(len(keyframes)), np.zeros(len(keyframes))
@@ -88,8 +88,8 @@ def _adjusted(
     model: CameraModel, keyframes: Sequence[Keyframe], poses: Sequence[Array], often: Sequence[Sequence[PointSighting]]
 ) -> tuple[Sequence[Array], Array, Truths]:
     """Return adjusted poses (3,) and tilts (N, 2) of N keyframes, and a mask (M,) of the observations that fit them.
-    ``often``: the observations of each point, M in all. If the adjustment fails, poses and tilts are the initial
-    ones."""
+    ``poses``: the initial poses. ``often``: the observations of each point, M in all. If the adjustment fails, poses
+    and tilts are the initial ones."""
     first = keyframes[0].index
     places = [camera_pose(model, pose) for pose in poses]
     points = []
@@ -110,11 +110,10 @@ def _adjusted(
 
 @dataclass(frozen=True)
 class LocalBundle:
-    """The least-squares problem of a local bundle adjustment: consecutive poses, tilts of the robot, and points.
-
-    ``odometry``: the factors between consecutive poses. ``pixels`` (M, 2): the observations of points.
-    ``frames`` (M,), ``owners`` (M,): indices of the pose and of the point of each observation. The first pose is fixed.
-    """
+    """The least-squares problem of a local bundle adjustment. A state is (poses (N, 3), tilts (N, 2), points (P, 3)),
+    with the poses and tilts of N consecutive keyframes. The first pose is fixed. ``model``: the camera. ``odometry``:
+    the factors between consecutive poses. ``pixels`` (M, 2): the observed pixels. ``frames``, ``owners`` (M,): the
+    indices of the keyframe and of the point of each pixel."""
 
     model: CameraModel
     odometry: OdometryStack
@@ -123,8 +122,8 @@ class LocalBundle:
     pixels: Array
 
     def linearize(self, state: State) -> tuple[Array, Array, Array]:
-        """Return the whitened, robustly weighted residuals (M, 2) of the pixels at ``state``, their Jacobian, and the
-        squared whitened residuals (M,) without weights."""
+        """Return the whitened residuals (M, 2) of the pixels at ``state``, with robust weights, and their Jacobian.
+        Also return the squared whitened residuals (M,) without weights."""
         poses, tilts, points = state
         at = poses[self.frames], tilts[self.frames], points[self.owners], self.pixels
         model = self.model
@@ -134,14 +133,16 @@ class LocalBundle:
         return linear
 
     def cost(self, state: State) -> float:
-        """Return the robust cost at ``state``: half the sum of squared whitened residuals, Huber losses for pixels."""
+        """Return the robust cost at ``state``: half the squared whitened residuals of odometry and tilts, and the Huber
+        losses of the pixels."""
         poses, tilts, _ = state
         of_pixels = huber_loss(self.linearize(state)[2], self.model.robust).sum()
         return float(of_pixels + 0.5 * np.sum(tilts**2) / self.model.tilt**2) + self.odometry.cost(poses, np.zeros(0))
 
     def moved(self, state: State, damping: float) -> tuple[State, float] | None:
-        """Return the state after a Levenberg-Marquardt step, and the largest component of the step. ``damping``: this
-        factor times the Hessian's diagonal is added to the Hessian. Returns None if the sum is singular."""
+        """Return the state after a Levenberg-Marquardt step from ``state``, and the largest absolute component of the
+        step. ``damping``: this factor times the Hessian's diagonal is added to the Hessian. Returns None if the sum is
+        singular."""
         poses, tilts, points = state
         residual, jacobian, _ = self.linearize(state)
         jacobian = jacobian[..., :CONSTANTS]
@@ -184,19 +185,18 @@ class LocalBundle:
 
 
 def _seen_often(first: int, waiting: Waiting) -> list[list[PointSighting]]:
-    """Return the observations of each point from keyframe number ``first`` and later ones. Points with fewer than
-    :data:`FEWEST` of these are left out. ``waiting``: all observations of each point that is not yet triangulated."""
+    """Return a list of the observations of each point from the keyframe with index ``first`` and later ones. Points
+    with fewer than :data:`FEWEST` of these are left out. ``waiting``: all observations of each point that is not yet
+    triangulated."""
     return [sightings for w in waiting.values() if len(sightings := [s for s in w if s.keyframe >= first]) >= FEWEST]
 
 
 def _turned(
     model: CameraModel, poses: Sequence[Array], first: int, often: Sequence[Sequence[PointSighting]]
 ) -> list[Array]:
-    """Return the ``poses`` (3,) of consecutive keyframes with corrected rotations between them.
-
-    The median change of bearing of the common points in both images replaces a rotation that differs by more than
-    :data:`SLIPPED`. ``first``: the number of the first keyframe. ``often``: the observations of each point.
-    """
+    """Return the ``poses`` (3,) of consecutive keyframes. The rotation between two keyframes is corrected if it differs
+    from the measured one by more than :data:`SLIPPED`. The measured rotation is the median change of bearing of points
+    that both images show. ``first``: the index of the first keyframe. ``often``: the observations of each point."""
     sides: list[dict[int, float]] = [{} for _ in poses]
     for i, sightings in enumerate(often):
         for s in sightings:
@@ -215,9 +215,9 @@ def _turned(
 class KeyframeCameras:
     """Computes the camera poses of a graph's keyframes, so that points can be triangulated.
 
-    ``estimated``: the estimated constants of the camera. ``twists``: the velocity (3,) of the robot, by number of the
-    keyframe. It is empty if the time offset of the camera is not estimated. ``anchored``: by number of the keyframe,
-    True if visible points of the graph determine the keyframe's pose.
+    ``estimated``: which constants of the camera the graph estimates. ``twists``: the velocity (3,) of the robot, by
+    index of the keyframe. It is empty if the time offset of the camera is not estimated. ``anchored``: by index of the
+    keyframe, True if visible points of the graph determine the keyframe's pose.
     """
 
     def __init__(self, model: CameraModel, estimated: Estimated) -> None:
@@ -232,26 +232,28 @@ class KeyframeCameras:
             self.twists[keyframe.index] = graph.motion.twist(keyframe.t)
 
     def anchor(self, keyframe: Keyframe, points: int) -> None:
-        """Store whether points of the graph determine a keyframe's pose. ``points``: the number of observed points."""
+        """Store True for a keyframe if the graph's points determine its pose, otherwise False. ``points``: the number
+        of points that the keyframe observes."""
         self.anchored[keyframe.index] = points >= ANCHORED
 
     def forget(self, first: int) -> None:
-        """Delete the stored data of the keyframes with numbers below ``first``."""
+        """Delete the stored data of the keyframes with indices below ``first``."""
         self.twists = {number: twist for number, twist in self.twists.items() if number >= first}
         self.anchored = {number: anchored for number, anchored in self.anchored.items() if number >= first}
 
     def at_image(self, keyframe: int, guess: Guess, graph: Graph) -> Guess:
-        """Return pose and covariance at an image's time of exposure. ``guess``: pose and covariance at the image's time
-        stamp. ``keyframe``: the number of the image's keyframe. The variance of the camera's time offset is added."""
+        """Return pose and covariance at the time of exposure of an image. ``guess``: pose and covariance at the image's
+        time stamp. ``keyframe``: the index of the image's keyframe. The covariance includes the variance of the
+        camera's time offset."""
         return self._moved(keyframe, guess, graph, 1.0)
 
     def at_stamp(self, keyframe: int, guess: Guess, graph: Graph) -> Guess:
-        """Return the pose and covariance at the time stamp of an image, the inverse of :meth:`at_image`. ``guess``:
-        pose and covariance at the time of exposure. ``keyframe``: the number of the image's keyframe."""
+        """Return pose and covariance at the time stamp of an image, the inverse of :meth:`at_image`. ``guess``: pose
+        and covariance at the time of exposure. ``keyframe``: the index of the image's keyframe."""
         return self._moved(keyframe, guess, graph, -1.0)
 
     def pose(self, keyframe: int, graph: Graph) -> Array:
-        """Return the estimated pose (3,) of the keyframe with this number, at the time of exposure of its image."""
+        """Return the estimated pose (3,) of the keyframe with this index, at the time of exposure of its image."""
         pose = graph.current(graph.keyframes[keyframe].key)
         return self._moved(keyframe, (pose, np.zeros((3, 3))), graph, 1.0)[0]
 
@@ -269,7 +271,7 @@ class KeyframeCameras:
     def cameras(
         self, newest: Keyframe, pose: Array, names: Iterable[Hashable], waiting: Waiting, graph: Graph
     ) -> dict[int, KeyframeCamera]:
-        """Return the camera poses, by number, of all keyframes that observe one of the points ``names``.
+        """Return {index of keyframe: camera pose} of all keyframes that observe one of the points ``names``.
 
         ``newest``: the newest keyframe, which is at ``pose`` (3,). ``waiting``: the observations of each point. The
         ``slack`` of a camera pose is its error relative to the newest camera pose, in pixels. The error is small if
@@ -285,7 +287,8 @@ class KeyframeCameras:
     def bundled(
         self, newest: Keyframe, pose: Array, waiting: Waiting, tilt: float, graph: Graph
     ) -> tuple[dict[int, KeyframeCamera], Array] | None:
-        """Return the adjusted camera poses of the last keyframes, by number, and the adjusted pose (3,) of ``newest``.
+        """Return {index of keyframe: adjusted camera pose} of the last keyframes, and the adjusted pose (3,) of
+        ``newest``.
 
         ``newest``: the newest keyframe, with the initial pose ``pose`` (3,). ``waiting``: the observations of the
         points that are adjusted with the poses. ``tilt``: standard deviation [rad] of the robot's roll and pitch.
@@ -305,8 +308,8 @@ class KeyframeCameras:
         return KeyframeCamera.of(self._model, pose, slacks[keyframe], graph.values[tilt_key(keyframe)])
 
     def _slacks(self, newest: Keyframe, graph: Graph) -> dict[int, float]:
-        """Return the errors [px] of the camera poses of the last keyframes relative to the newest one, by number of the
-        keyframe."""
+        """Return {index of keyframe: error [px]} of the camera poses of the last keyframes, relative to the newest
+        one."""
         slacks: dict[int, float] = {}
         # variances of the odometry's rotation: from the newest keyframe back to the last anchored one; from an older
         # keyframe to the next anchored one

@@ -41,12 +41,9 @@ FARTHEST = 15.0  # m: largest distance of a point that is searched
 
 @dataclass(frozen=True)
 class OldPoints:
-    """N points of the graph that were last observed long ago.
-
-    ``points``: the positions, which may be outdated, with the descriptor of one view of each point. ``keys``: the
-    points' keys in the graph. ``travelled`` (N,): the path length of the robot [m] at the last observation of each
-    point.
-    """
+    """N points of the graph that were last observed long ago. ``points``: the positions, which may be outdated, with
+    the descriptor of one view of each point. ``keys``: the points' keys in the graph. ``travelled`` (N,): the path
+    length of the robot [m] at the last observation of each point."""
 
     points: PointMap
     keys: Sequence[int]
@@ -55,11 +52,8 @@ class OldPoints:
 
 @dataclass(frozen=True)
 class Image:
-    """The image of a new keyframe.
-
-    ``frame``: the features of the image. ``keyframe``: the keyframe. ``guess``: the predicted pose of the keyframe with
-    covariance. ``travelled``: the path length of the robot since the start [m].
-    """
+    """The image of a new keyframe. ``frame``: its features. ``keyframe``: the keyframe. ``guess``: the predicted pose
+    of the keyframe with covariance. ``travelled``: the path length of the robot since the start [m]."""
 
     frame: CameraFrame
     keyframe: Keyframe
@@ -82,14 +76,16 @@ class Revisit:
 
 
 class LoopClosure:
-    """Detector of loop closures: several consecutive images must show points of long ago, from consistent poses."""
+    """A detector of loop closures. A loop is closed if several consecutive images show points that were last observed
+    long ago, from consistent poses."""
 
     def __init__(self) -> None:
         self._agreeing: list[Revisit] = []  # revisits of the last consecutive images, which agree with each other
         self._last_time = -math.inf  # s; the time of the last image that was compared
 
     def is_due(self, t: float) -> bool:
-        """Return True if at least :data:`INTERVAL` has passed at ``t`` [s] since the last comparison of an image."""
+        """Return True if the time ``t`` [s] is at least :data:`INTERVAL` after the last image that was compared with
+        old points."""
         return t >= self._last_time + INTERVAL
 
     def compare(
@@ -115,7 +111,9 @@ class LoopClosure:
 
 
 def _revisit(model: CameraModel, image: Image, old: OldPoints, current: Callable[[int], Array]) -> Revisit | None:
-    """Return the old points that one image shows, None if too few. For arguments see :meth:`LoopClosure.compare`."""
+    """Return the old points that one image shows, and the pose that they determine. Returns None if they are too few,
+    or the pose is implausible. ``old``: the points to search. ``current``: a function that returns the newest estimate
+    of a variable of the graph, by key."""
     near = np.flatnonzero(_in_reach(model, lifted(model, *image.guess), old.points))
     recognised = None if len(near) < FEWEST else _recognised(model, image.frame, _newest(old, near, current))
     if recognised is None:
@@ -129,8 +127,8 @@ def _revisit(model: CameraModel, image: Image, old: OldPoints, current: Callable
 
 
 def _recognised(model: CameraModel, frame: CameraFrame, points: PointMap) -> tuple[Array, Integers, Integers] | None:
-    """Return the pose (3,) of the robot, and the indices (M,) of matched ``points`` and of features of ``frame``.
-    Returns None if the pose is not on the floor, or if too few visible points match."""
+    """Return the pose (3,) of the robot, and the indices (M,) of matched ``points`` and of their features in ``frame``.
+    Returns None if the robot would not be on the floor, or if too few visible points match."""
     associator = Associator(points, model)
     somewhere = associator.relocalized(frame)
     if somewhere is None:
@@ -158,8 +156,8 @@ def _on_floor(
 
 
 def _is_plausible(guess: Guess, pose: Array, travelled: float) -> bool:
-    """Return True if drift over a path of length ``travelled`` [m] explains the difference between ``pose`` (3,) and
-    the estimated pose ``guess``."""
+    """Return True if drift of the odometry over ``travelled`` [m] explains the difference between ``pose`` (3,) and the
+    estimate ``guess``."""
     off = se2.log(se2.between(guess[0], pose))
     drift = DRIFT + DRIFT_PER_METRE * travelled
     return bool(positive.squared(off, guess[1] + np.diag(drift**2)) < GATE)
@@ -187,14 +185,14 @@ def _in_reach(model: CameraModel, camera: CameraPose, points: PointMap) -> Truth
 
 
 def _newest(old: OldPoints, rows: Integers, current: Callable[[int], Array]) -> PointMap:
-    """Return the ``old`` points with the indices ``rows``, moved to their newest estimates. ``current``: returns the
-    estimate of a point by key. The camera positions of the views are shifted by the same amount."""
+    """Return the ``old`` points with the indices ``rows``, at their newest estimates. ``current``: a function that
+    returns the newest estimate of a point by key. The camera positions of the views are shifted like the points."""
     points = old.points.chosen(rows)
     positions = np.array([current(old.keys[i]) for i in rows.tolist()])
     return replace(points, positions=positions, seen_from=points.seen_from + positions - points.positions)
 
 
 def _is_spread_out(model: CameraModel, pixels: Array) -> bool:
-    """Return True if ``pixels`` (K, 2) are in at least :data:`CELLS` cells of a grid over the image."""
+    """Return True if ``pixels`` (K, 2) are in at least :data:`CELLS` different cells of a grid over the image."""
     cells = np.floor(pixels / (model.width, model.height) * GRID)
     return len(np.unique(cells, axis=0)) >= CELLS

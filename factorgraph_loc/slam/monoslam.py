@@ -246,16 +246,18 @@ class Monoslam(Filter):
         self._state = replace(state, image_odometry=self._odometry)
 
     def _match(self, m: Pixels, state: SlamState, eye: Eye) -> tuple[SlamState, Match]:
-        """Match the pixels of ``m`` with points. Returns the predicted state and the matches. If points are estimated
-        and the image shows that the wheels slipped, the returned state has a larger covariance."""
+        """Return the predicted state, and the matches of the pixels of ``m`` with points. If points are estimated, and
+        the image shows that the wheels slipped, the returned state has a larger covariance than ``state``. ``eye``: the
+        camera."""
         if self._settings.landmarks == "known" or state.image_odometry is None:
             return state, self._matcher.match(m, state, eye)
         slip = self._motion.slip(self._motion.relative(state.image_odometry, self._odometry))
         return self._matcher.unless_slipped(m, state, eye, *slip)
 
     def _corrected(self, m: Pixels, prior: SlamState, eye: Eye, match: Match) -> SlamState:
-        """Return the state after a Kalman update of ``prior`` with the matched pixels ``match``. In a known map, the
-        update is iterated with Huber weights. The noise of pixels far from their prediction is increased."""
+        """Return the state after a Kalman update of ``prior`` with the matched pixels ``match``. ``eye``: the camera.
+        In a known map, the update is iterated with Huber weights. The noise of pixels far from their prediction is
+        increased."""
         known = match.mapped, match.points, match.covariances
         zero = np.zeros(len(prior.covariance))
         sights = eye.all(prior, *known)
@@ -291,11 +293,10 @@ class Monoslam(Filter):
             self.diagnostics.add_residuals(f"camera.{name}", residual[:, i].tolist())
 
     def _relocated(self, m: Pixels, state: SlamState, eye: Eye, match: Match) -> tuple[SlamState, bool]:
-        """Return the state, and True if it was relocalized in the whole map. This is tried if several images had no
-        matches, or if the pose is very uncertain.
-
-        A relocalized state has no estimated points, because these belong to the old pose.
-        """
+        """Return a state, and True if it was relocalized in the whole map. Otherwise return ``state`` and False.
+        Relocalization is tried if several images had no matches, or if the pose is very uncertain. A relocalized state
+        has no estimated points, because these belong to the old pose. ``eye``: the camera. ``match``: the matches of
+        the image."""
         lost = state.lost + 1 if match.wanted and not len(match.pixels) else 0
         camera = self._matcher.relocated(m, eye) if lost >= LOST_AFTER or self._is_vague(state) else None
         relocated = None if camera is None else self._standing(camera, eye, state)
@@ -305,12 +306,13 @@ class Monoslam(Filter):
         return relocated, True
 
     def _is_vague(self, state: SlamState) -> bool:
-        """Return True if the map is known and the pose is too uncertain for the linearisation of a Kalman update."""
+        """Return True if the map is known, and the pose is too uncertain for a Kalman update, which linearises."""
         return self._settings.landmarks == "known" and bool(np.diag(state.covariance)[:6].max() > LARGEST_SIGMA**2)
 
     def _standing(self, camera: CameraPose, eye: Eye, lost_state: SlamState) -> SlamState | None:
-        """Return the state of a robot at a relocalized ``camera`` pose. Returns None if this robot would not be level
-        on the floor. ``lost_state``: the state before, with the odometry's constants."""
+        """Return the state of a robot with a relocalized ``camera`` pose. Returns None if this robot would not stand
+        level on the floor. ``lost_state``: the state before, which supplies the odometry's constants. ``eye``: the
+        camera."""
         s = self._settings
         position, rotation = carrier(eye.model, camera.position, camera.rotation)
         robot = RobotState(position, rotation, np.zeros(3), np.zeros(3))
@@ -324,8 +326,9 @@ class Monoslam(Filter):
         return SlamState(robot, lost_state.constants, covariance, floor=lost_state.floor)
 
     def _managed(self, m: Pixels, state: SlamState, eye: Eye, match: Match) -> SlamState:
-        """Return the state with updated points after an image. Matches are counted, and bad points are deleted. New
-        points are added, and points of known depth are converted to x, y, z."""
+        """Return ``state`` with updated points after the image ``m`` with the matches ``match``. Matches are counted,
+        bad points are deleted, and new points are added. Points of known depth are converted to x, y, z. ``eye``: the
+        camera."""
         state = counted(state, match.expected, frozenset(match.mapped), m.t)
         frame = m.frame
         wanted = min(self._settings.per_image, self._settings.max_points)

@@ -17,13 +17,11 @@ from factors.se2 import Array
 
 
 def carried(prior: SlamState, posterior: SlamState, scale: int | None) -> Array:
-    """Return the covariance (12 + P + D, 12 + P + D) of ``posterior``, without false information on unobservable
-    directions. It is the covariance after an update in the invariant error state (see the module docstring).
-
-    ``prior``: the state before the update. ``posterior``: the state after an ordinary update, with its covariance.
-    ``scale``: the index of the odometry's constant that scales distances, or None if this constant is not estimated. P
-    is the number of constants of the odometry, and D the number of values of points.
-    """
+    """Return the covariance (12 + P + D, 12 + P + D) of ``posterior`` without false information on unobservable
+    directions, which an ordinary update adds. P is the number of constants of the odometry, and D the number of values
+    of points. ``prior``: the state before the update. ``posterior``: the state after an ordinary update, with its
+    covariance. ``scale``: the index of the odometry's constant that scales distances, or None if this constant is not
+    estimated."""
     covariance = posterior.covariance
     own, ours = prior.robot, posterior.robot
     by_turn, by_scale = _by_turn(prior, posterior), _by_scale(prior, posterior)
@@ -41,8 +39,8 @@ def carried(prior: SlamState, posterior: SlamState, scale: int | None) -> Array:
 
 
 def _by_turn(prior: SlamState, posterior: SlamState) -> Array:
-    """Return the Jacobian (12 + P + D, 3) of the error state at ``posterior`` by a rotation of the world, minus the one
-    at ``prior``. The rows of the robot's rotation are zero."""
+    """Return the Jacobian (12 + P + D, 3) of the error state by a rotation of the world, at ``posterior`` minus at
+    ``prior``. The rows of the robot's rotation are zero."""
     own, ours = prior.robot, posterior.robot
     change = np.zeros((len(posterior.covariance), 3))
     change[SHIFT] = ours.rotation.T @ cross(own.position - ours.position)
@@ -58,8 +56,8 @@ def _by_turn(prior: SlamState, posterior: SlamState) -> Array:
 
 
 def _by_scale(prior: SlamState, posterior: SlamState) -> Array:
-    """Return the derivative (12 + P + D,) of the error state at ``posterior`` by the scale of the world, minus the one
-    at ``prior``. The row of the scale itself is zero."""
+    """Return the derivative (12 + P + D,) of the error state by the scale of the world, at ``posterior`` minus at
+    ``prior``. The row of the scale itself is zero."""
     own, ours = prior.robot, posterior.robot
     change = np.zeros(len(posterior.covariance))
     change[SHIFT] = ours.rotation.T @ (ours.position - own.position)

@@ -20,7 +20,8 @@ FEWEST_TRIALS, LEAST_FOUND = 8, 0.5
 
 
 def with_point(state: SlamState, point: MapPoint, eye: Eye, pixel: Array) -> SlamState:
-    """Return the state with a new ``point``, which the camera ``eye`` observes at ``pixel`` (2,)."""
+    """Return ``state`` with a new ``point``, which the camera ``eye`` observes at ``pixel`` (2,). Its depth is
+    unknown."""
     position, rotation = eye.pose(state.robot)
     ray, by_camera, by_seen = inverse_depth.begin(eye.model, position, rotation, pixel, INVERSE_DEPTH)
     by_pose = by_camera @ eye.lift
@@ -37,8 +38,8 @@ def with_point(state: SlamState, point: MapPoint, eye: Eye, pixel: Array) -> Sla
 
 
 def settled(state: SlamState, eye: Eye) -> SlamState:
-    """Return the state with points of certain depth converted from inverse depth to x, y, z. ``eye``: the camera. The
-    criterion is the linearity index of Civera, Davison and Montiel (2008)."""
+    """Return ``state`` with points of certain depth converted from inverse depth to x, y, z. A depth is certain if the
+    linearity index of Civera, Davison and Montiel (2008) is small. ``eye``: the camera."""
     position, _ = eye.pose(state.robot)
     rays = [i for i, p in enumerate(state.points) if p.ray]
     if not rays:
@@ -99,7 +100,7 @@ def _is_beyond_infinity(state: SlamState, place: int) -> bool:
 
 
 def without(state: SlamState, which: Collection[int]) -> SlamState:
-    """Return the state without the points with the indices ``which``."""
+    """Return ``state`` without the points with the indices ``which``."""
     if not which:
         return state
     kept = np.repeat([i not in which for i in range(len(state.points))], [p.size for p in state.points])

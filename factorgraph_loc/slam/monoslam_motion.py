@@ -49,7 +49,8 @@ class RobotState:
         )
 
     def minus(self, reference: RobotState) -> Array:
-        """Return the error (12,) of this state relative to ``reference``."""
+        """Return the error (12,) of this state relative to ``reference``, in the order rotation, position, velocity,
+        turn rate. It is the inverse of :meth:`plus`."""
         turn = log(reference.rotation.T @ self.rotation)
         shift = reference.rotation.T @ (self.position - reference.position)
         return np.concatenate((turn, shift, self.velocity - reference.velocity, self.rate - reference.rate))
@@ -80,17 +81,15 @@ class Step:
         return result
 
     def then(self, transition: Array, noise: Array, robot: RobotState) -> Step:
-        """Return this step followed by another step, as one step. ``transition``, ``noise`` (12, 12): of the other
-        step, which must not depend on the constants of the odometry. ``robot``: the state after the other step."""
+        """Return one step that is this step followed by another. ``transition``, ``noise`` (12, 12): of the other step,
+        which must not depend on the constants of the odometry. ``robot``: the state after the other step."""
         return Step(robot, transition @ self.transition, transition @ self.noise @ transition.T + noise)
 
 
 @dataclass(frozen=True)
 class Origin:
     """The start of a run without a map. Its uncertainty is not in the filter's state, but is added to estimates.
-
-    ``robot``: the state at the start. ``covariance`` (6, 6): the covariance of the start pose, in the robot's frame.
-    """
+    ``robot``: the state at the start. ``covariance`` (6, 6): the covariance of the start pose, in the robot's frame."""
 
     robot: RobotState
     covariance: Array
@@ -140,12 +139,11 @@ def measured(robot: RobotState, delta: Array, covariance: Array, by_constants: A
 
 
 def on_the_floor(step: Step, dt: float, height_sigma: float, tilt_sigma: float, settling: float) -> Step:
-    """Return the prediction ``step`` followed by a decay of height, roll and pitch towards zero. Use it if a robot on a
-    floor tilts only slightly.
+    """Return the prediction ``step`` of a robot on a floor, which tilts only slightly. Height, roll and pitch decay
+    towards zero.
 
-    Height, roll and pitch are a stationary process with mean zero and without velocity. ``height_sigma`` [m] and
-    ``tilt_sigma`` [rad] are its standard deviations, ``settling`` [s] its time constant. ``dt`` [s]: duration of
-    ``step``.
+    They are a stationary process with mean zero and without velocity. ``height_sigma`` [m] and ``tilt_sigma`` [rad] are
+    its standard deviations, ``settling`` [s] its time constant. ``dt`` [s]: the duration of ``step``.
     """
     keep = math.exp(-dt / settling)
     robot = step.robot

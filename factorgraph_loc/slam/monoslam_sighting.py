@@ -70,7 +70,7 @@ def agreeing(residual: Array, innovation: Innovation, noise: Array) -> Truths:
 
 
 def _confirmed(residual: Array, total: Array, right: Truths) -> Truths:
-    """Return the mask ``right`` (K,) of inlier matches with outliers set to False, one at a time, the worst first.
+    """Return a mask (K,) of inliers: ``right`` (K,) with outliers set to False, one at a time, the worst first.
 
     An outlier contradicts the pixel predicted from the remaining matches. ``residual`` (K, 2): measured minus predicted
     pixels. ``total`` (2K, 2K): the innovation covariance with noise.
@@ -118,11 +118,8 @@ class Match:
 
 
 class FeatureMatcher:
-    """Matches the pixels of an image with points of the map and of the filter's state.
-
-    ``use``: the points to match. ``known`` matches points of the map only, ``unknown`` points of the state only,
-    ``extended`` both.
-    """
+    """Matches the pixels of an image with points of the map and of the filter's state. ``use``: the points to match.
+    "known" are points of the map only, "unknown" points of the state only, "extended" both."""
 
     def __init__(self, setup: Setup, diagnostics: Diagnostics, use: MapUse) -> None:
         self._diagnostics = diagnostics
@@ -219,8 +216,8 @@ class FeatureMatcher:
         return replace(self._match(m.pixels, outside, known, which, wanted), tempering=eye.model.tempering)
 
     def relocated(self, m: Pixels, eye: Eye) -> CameraPose | None:
-        """Return the camera pose, computed only from the image ``m`` and the map. Returns None if they do not determine
-        it. ``eye``: the camera."""
+        """Return the camera pose, computed only from the image ``m`` and the map. Returns None if image and map do not
+        determine it. ``eye``: the camera."""
         if m.frame is not None:
             relocated = None if self._associator is None else self._associator.relocalized(m.frame)
             return None if relocated is None else relocated[0]
@@ -234,7 +231,8 @@ class FeatureMatcher:
         return place.camera
 
     def _known(self, m: CameraFrame, state: SlamState, eye: Eye) -> tuple[list[tuple[int, int]], int]:
-        """Return matching pairs (index of a feature, index of a map point), and the number of pairs to expect."""
+        """Return matching pairs (index of a feature, index of a map point), and the number of pairs to expect. ``m``:
+        the features of the image. ``state``: the predicted state. ``eye``: the camera."""
         if self._associator is None:
             if not self._grows:
                 self._diagnostics.ignore("camera", len(m.pixels))
@@ -254,7 +252,8 @@ class FeatureMatcher:
     def _agreeing(
         self, pixels: Array, ours: list[tuple[int, int]], state: SlamState, eye: Eye
     ) -> list[tuple[int, int]]:
-        """Return the inliers among the pairs ``ours`` (index in ``pixels``, point of the state)."""
+        """Return the inliers among the pairs ``ours`` (index in ``pixels``, index of a point of the state). ``state``:
+        the predicted state. ``eye``: the camera."""
         if not ours:
             return ours
         sights = eye.mapped(state, [p for _, p in ours])
@@ -264,7 +263,8 @@ class FeatureMatcher:
     def _agreeing_known(
         self, pixels: Array, known: list[tuple[int, int]], state: SlamState, eye: Eye
     ) -> list[tuple[int, int]]:
-        """Return the inliers among the pairs ``known`` (index in ``pixels``, point of the map)."""
+        """Return the inliers among the pairs ``known`` (index in ``pixels``, index of a map point). ``state``: the
+        predicted state. ``eye``: the camera."""
         if len(known) < FEWEST:
             return known
         points = self._map.positions[[p for _, p in known]]
@@ -304,7 +304,8 @@ class FeatureMatcher:
 
 
 def _visible(eye: Eye, sights: Sights) -> tuple[Sights, Integers]:
-    """Return the elements of ``sights`` with a point in front of the camera and inside its image, and their indices."""
+    """Return the predicted pixels ``sights`` of only those points that are in front of the camera and inside its image.
+    Also return the indices of these points."""
     inside = np.flatnonzero((sights.depths > 0.0) & eye.model.contains(sights.pixels))
     return sights[inside], inside
 

@@ -65,12 +65,12 @@ class MapPoint:
 class SlamState:
     """The state of the filter.
 
-    ``robot``: the state of the robot. ``constants`` (P,): corrections of the odometry's constants.
-    ``covariance`` (12 + P + D, 12 + P + D): the covariance of the error state.
-    ``points``, ``values`` (D,): the points of the state, and their values one point after the other. ``tracks``: the
-    numbers of the feature tracks of the newest image. ``met``: the number of points added since the start. ``lost``:
-    the number of consecutive images without a match. ``image_odometry``: the odometry at the newest image. ``floor``:
-    the estimated standard deviation of the robot's tilt, or None if it is not estimated.
+    ``robot``: the state of the robot. ``constants`` (P,): corrections of the odometry's constants. ``covariance`` (12 +
+    P + D, 12 + P + D): of the error of robot, constants and points. ``points``, ``values`` (D,): the points of the
+    state, and their values one point after the other. ``tracks``: the numbers of the feature tracks of the newest
+    image. ``met``: the number of points ever added. ``lost``: the number of consecutive images without a match.
+    ``image_odometry``: the odometry at the newest image. ``floor``: the estimated standard deviation of the robot's
+    tilt, or None if it is not estimated.
     """
 
     robot: RobotState
@@ -104,7 +104,7 @@ class SlamState:
 
     def sway(self, usual: float) -> tuple[float, float]:
         """Return the standard deviation of roll and pitch [rad], and the time constant [s] of their change. ``usual``:
-        the standard deviation if none is estimated."""
+        the standard deviation to return if the filter does not estimate it."""
         return (usual, SETTLING) if self.floor is None else (self.floor.sigma, UNEVEN)
 
     def widened(self, planar: Array) -> SlamState:
@@ -170,8 +170,8 @@ class Sights:
         return Sights(*(getattr(self, name)[rows] for name in Sights.__dataclass_fields__))
 
     def columns(self) -> tuple[Integers, Array]:
-        """Return the indices (C,) of the values of the error state that influence the pixels, and the Jacobian (2K, C)
-        of the pixels by these values."""
+        """Return the indices (C,) of the components of the error state that influence the pixels. Also return the
+        Jacobian (2K, C) of the pixels by these components."""
         own = np.unique(self.starts[self.sizes > 0], return_index=True, return_inverse=True)
         where, first, which = own
         sizes = self.sizes[self.sizes > 0][first]
@@ -243,8 +243,8 @@ class Eye:
         return Sights(pixels, depths, by_camera @ self.lift, by_point, starts + state.base, sizes, noise)
 
     def all(self, state: SlamState, which: Sequence[int], points: Array, covariances: Array | None) -> Sights:
-        """Return the predicted pixels of the points ``which`` of the state, followed by the pixels of map points (see
-        :meth:`known`)."""
+        """Return the predicted pixels of the points ``which`` (indices) of the state, followed by those of map points.
+        ``points`` (K, 3), ``covariances`` (K, 3, 3): positions of the map points, and their covariances or None."""
         first, second = self.mapped(state, which), self.known(state.robot, points, covariances)
         if not len(first) or not len(second):
             return first if len(first) else second
@@ -314,8 +314,8 @@ def starting(sigmas: Array) -> Array:
 def widened(noise: Array, residual: Array, innovation: Innovation) -> Array:
     """Return ``noise`` (K, 2, 2) with larger covariances for pixels that are far from their prediction.
 
-    Let r be the ratio of a ``residual``'s (K, 2) squared Mahalanobis distance to the limit of inliers. If r > 1, the
-    noise is multiplied by r^2.
+    Let r be the squared Mahalanobis distance of a ``residual`` (K, 2), divided by the limit of inliers. If r > 1, the
+    noise is multiplied by r^2. ``innovation``: the covariance of the predicted pixels.
     """
     excess = np.maximum(1.0, squared(residual, innovation.each(noise)) / GATE)
     return np.asarray(noise * (excess**2)[:, None, None])

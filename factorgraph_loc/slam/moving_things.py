@@ -33,10 +33,8 @@ FARTHEST, NEAREST, DISTANCES = 100.0, 0.5, 2  # m: bounds of a point's distance;
 
 
 class MovingThings:
-    """Classifies feature tracks as static or moving, from the images of the last :data:`MAX_TIME` seconds.
-
-    ``moving``: the names of the tracks on moving objects.
-    """
+    """Classifies feature tracks as static or moving, from the images of the last :data:`MAX_TIME` seconds. ``moving``:
+    the names of the tracks on moving objects."""
 
     def __init__(self, model: CameraModel) -> None:
         self._model = model
@@ -46,8 +44,8 @@ class MovingThings:
         self._doubts = False  # True while the newest image has tracks on moving objects
 
     def is_static(self, name: Hashable) -> bool:
-        """Return True if the feature track ``name`` is on a static object. While the image shows moving objects, only
-        tracks that agreed with the odometry count as static."""
+        """Return True if the feature track ``name`` is not known to be on a moving object. While the newest image shows
+        moving objects, the track must also have agreed with the odometry once."""
         return name not in self.moving and (not self._doubts or name in self._steady)
 
     def learn(self, keyframe: Keyframe, names: Sequence[Hashable], pixels: Array, graph: Graph) -> None:
@@ -65,8 +63,8 @@ class MovingThings:
         self._doubts = not self.moving.isdisjoint(names)
 
     def _compare(self, old: Mapping[Hashable, Array], new: Mapping[Hashable, Array], step: Increment) -> None:
-        """Update the classification with two images. ``old``, ``new``: the pixel of each track by name. ``step``: the
-        motion of the odometry between the images."""
+        """Update the classification with two images. ``old``, ``new``: {name of a track: its pixel} in the images.
+        ``step``: the motion between the images by odometry."""
         common = [name for name in new if name in old]
         if not common:
             return
@@ -82,12 +80,13 @@ class MovingThings:
 
 
 def another(model: CameraModel, first: Array, second: Array, step: Increment, right: Truths) -> Truths:
-    """Return a mask (K,) of the feature tracks that fit a second rotation of the robot. This rotation must explain the
-    tracks that disagree with the odometry.
+    """Return a mask (K,) of the feature tracks that fit another rotation of the robot than the odometry's. The rotation
+    is the one that explains the most tracks that disagree with the odometry.
 
-    ``first``, ``second`` (K, 2): the pixels of K tracks in two images. ``step``: the motion of the odometry between the
-    images. ``right`` (K,): mask of the tracks that agree with ``step``. The mask is False everywhere if most tracks
-    agree with ``step``, or if no rotation explains the fraction :data:`EXPLAINED` of the others.
+    ``first``, ``second`` (K, 2): the pixels of K tracks in two images. ``step``: the motion between the images by
+    odometry. ``right`` (K,): mask of the tracks that agree with ``step``. The mask is False everywhere in two cases.
+    Most tracks agree with ``step``. Or the rotation explains less than the fraction :data:`EXPLAINED` of the other
+    tracks.
     """
     best, unexplained = right, ~right
     if 2 * np.count_nonzero(unexplained) >= len(right):
@@ -104,11 +103,11 @@ def another(model: CameraModel, first: Array, second: Array, step: Increment, ri
 
 
 def fitting(model: CameraModel, first: Array, second: Array, step: Increment) -> Truths:
-    """Return a mask (K,) of the feature tracks that fit a motion ``step`` of the robot, at a suitable distance.
+    """Return a mask (K,) of the feature tracks that fit the motion ``step`` of the robot.
 
-    ``first``, ``second`` (K, 2): the pixels of K tracks before and after the motion. Two distances are tried. The first
-    is where the rays are nearest to each other. The second is a Gauss-Newton step from there, which considers the
-    covariance of the motion.
+    ``first``, ``second`` (K, 2): the pixels of K tracks before and after the motion. A track fits if its second pixel
+    is near the prediction for one of two distances of the object. The first distance brings the two rays nearest to
+    each other. The second is a Gauss-Newton step from there, which considers the covariance of the motion.
     """
     first_rays, second_rays = (rays(model, pixels) @ model.rotation.T for pixels in (first, second))
     camera = lifted(model, step.delta, step.covariance)

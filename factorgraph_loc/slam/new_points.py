@@ -30,8 +30,8 @@ UPRIGHT = np.zeros(2)
 
 @dataclass(frozen=True, slots=True)
 class PointSighting:
-    """An observation of a point from a keyframe. ``keyframe``: its number. ``pixel`` (2,): the observed pixel. ``ray``
-    (3,): the unit vector from the camera to the point, in the camera frame."""
+    """An observation of a point from a keyframe. ``keyframe``: the index of the keyframe. ``pixel`` (2,): the observed
+    pixel. ``ray`` (3,): the unit vector from the camera to the point, in the camera frame."""
 
     keyframe: int
     pixel: Array
@@ -39,7 +39,7 @@ class PointSighting:
 
 
 def sightings_of(model: CameraModel, keyframe: int, pixels: Array) -> list[PointSighting]:
-    """Return one observation per row of ``pixels`` (K, 2), from the keyframe with number ``keyframe``."""
+    """Return one observation per row of ``pixels`` (K, 2), from the keyframe with the index ``keyframe``."""
     rays = reprojection.rays(model, pixels)
     rays /= np.linalg.norm(rays, axis=1)[:, None]
     return list(map(PointSighting, repeat(keyframe), pixels, rays))
@@ -47,7 +47,7 @@ def sightings_of(model: CameraModel, keyframe: int, pixels: Array) -> list[Point
 
 @dataclass(frozen=True)
 class ChosenSightings:
-    """N observations of points (``sightings``) from a keyframe. ``rows``: their indices in the image's measurement.
+    """N observations of points (``sightings``) from a keyframe. ``rows``: the index of each in the image's measurement.
     ``names``: the name of each point, or the number of its feature track. ``pixels`` (N, 2): the observed pixels."""
 
     rows: list[int]
@@ -77,11 +77,8 @@ class KeyframeCamera:
 
 @dataclass(frozen=True, slots=True)
 class TriangulatedPoint:
-    """A triangulated point.
-
-    ``position`` (3,): in the world frame. ``covariance`` (3, 3): of the position, if the camera poses are exact.
-    ``squared`` (M,): squared whitened residuals of the observations.
-    """
+    """A triangulated point. ``position`` (3,): in the world frame. ``covariance`` (3, 3): of the position, if the
+    camera poses are exact. ``squared`` (M,): squared whitened residuals of its M observations."""
 
     position: Array
     covariance: Array
@@ -89,11 +86,8 @@ class TriangulatedPoint:
 
 
 class NewPoints:
-    """Collects observations of points until the points can be triangulated.
-
-    ``waiting``: the observations of each point that is not triangulated yet. Its key is a name, or the number of a
-    track.
-    """
+    """Collects observations of points until the points can be triangulated. ``waiting``: {point: observations} of the
+    points that are not triangulated yet. A point is given by its name, or by the number of its feature track."""
 
     def __init__(self, model: CameraModel) -> None:
         self._model = model
@@ -114,8 +108,8 @@ class NewPoints:
         return {name: sightings for name, sightings in self.waiting.items() if is_wanted(name)}
 
     def forget(self, keyframe: int, wrong: Container[Hashable] = ()) -> None:
-        """Delete the points ``wrong``, and all points that were not observed in the last :data:`PATIENCE` keyframes
-        before number ``keyframe``."""
+        """Delete the points ``wrong``. Also delete all points that were not observed in the last :data:`PATIENCE`
+        keyframes before the one with the index ``keyframe``."""
         since = keyframe - PATIENCE
         self.waiting = {k: v for k, v in self.waiting.items() if v[-1].keyframe >= since and k not in wrong}
 
@@ -124,8 +118,8 @@ class NewPoints:
     ) -> list[tuple[Hashable, TriangulatedPoint, list[PointSighting]]]:
         """Return (name, point, consistent observations) for the points among ``names`` that can be triangulated.
 
-        The observations of a returned point are deleted. ``places``: a function that returns the camera pose of a
-        keyframe by number, None if its observations must not be used. ``most``: the largest number of results.
+        The observations of a returned point are deleted. ``places``: returns the camera pose of the keyframe with an
+        index, or None if observations from this keyframe must not be used. ``most``: the largest number of results.
         """
         determined: list[tuple[Hashable, TriangulatedPoint, list[PointSighting]]] = []
         known: dict[int, KeyframeCamera | None] = {}
@@ -164,8 +158,8 @@ def agreed(
 ) -> tuple[TriangulatedPoint, list[PointSighting]] | None:
     """Return a triangulated point and its consistent observations, without outliers.
 
-    ``places``: the camera pose of each observation. While the residuals are too large, the worst observation is
-    removed. Returns None if the remaining observations do not determine the point.
+    ``sightings``: the observations. ``places``: the camera pose of each. While the residuals are too large, the worst
+    observation is removed. Returns None if the remaining observations do not determine the point.
     """
     sightings, places = list(sightings), list(places)
     point = triangulate(model, sightings, places)
@@ -194,9 +188,9 @@ def triangulate(
 ) -> TriangulatedPoint | None:
     """Return a point triangulated from M observations, with minimal squared residuals in the images.
 
-    ``places``: the camera pose of each observation. Residuals are infinite in cameras that have the point behind them.
-    Returns None if the rays are nearly parallel, or if the standard deviation exceeds :data:`MAX_SPREAD` times the
-    least depth.
+    ``places``: the camera pose of each observation. The residual is infinite for a camera that has the point behind it.
+    Returns None if the rays are nearly parallel, or if the standard deviation of the position exceeds
+    :data:`MAX_SPREAD` times the least depth.
     """
     is_determined, *result = kernels.triangulated(
         reprojection.lens_of(model),

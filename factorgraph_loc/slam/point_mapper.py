@@ -41,7 +41,7 @@ class PointMapper(UnknownPoints):
         return m.t - self._taken >= KEYFRAME_INTERVAL or self._has_lost_features(m)
 
     def _has_lost_features(self, m: Pixels) -> bool:
-        """Return True if an image has too few feature tracks in common with the image of the last keyframe."""
+        """Return True if the image ``m`` has too few feature tracks in common with the image of the last keyframe."""
         if m.frame is None or not self._tracks:
             return False
         tracks = set(m.frame.tracks.tolist()) - self._things.moving
@@ -74,7 +74,8 @@ class PointMapper(UnknownPoints):
 
 
 def bind(sensors: Mapping[str, Sensor], diagnostics: Diagnostics, settings: GraphSettings) -> Mapper:
-    """Return the object that adds points to a graph. It adds none if there is no camera, or if the map is known."""
+    """Return the object that adds points to a graph. It adds none if no camera is among ``sensors`` (by name), or if
+    the map is known."""
     camera = next((sensor for sensor in sensors.values() if isinstance(sensor, CameraSensor)), None)
     if camera is None or settings.landmarks == "known":
         return Mapper()

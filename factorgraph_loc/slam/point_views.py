@@ -60,11 +60,9 @@ class PointViews:
         return self._views[key]
 
     def keep(self, point: int, frame: CameraFrame, row: int, travelled: float, keyframe: int, guess: Guess) -> None:
-        """Store a view of the point with the key ``point``.
-
-        ``row``: the feature of the point in ``frame``. ``travelled`` [m]: the path length of the robot since the start.
-        ``keyframe``, ``guess``: the key and the estimated pose of the keyframe of the image.
-        """
+        """Store a view of the point with the key ``point``. ``row``: the row of the point's feature in ``frame``.
+        ``travelled`` [m]: the path length of the robot since the start. ``keyframe``, ``guess``: the key and the
+        estimate of the pose of the image's keyframe."""
         self._feature = frame.feature
         seen_from = camera_pose(self._model, guess[0])[0]
         view = PointView(frame.descriptors[row], seen_from, travelled, keyframe, guess)
@@ -80,11 +78,11 @@ class PointViews:
     def refound(
         self, camera: CameraPose, points: Sequence[int], positions: Array, frame: CameraFrame, rows: Sequence[int]
     ) -> list[tuple[int, int]]:
-        """Return pairs (index in ``points``, row of ``frame``) of points found again after their feature tracks were
-        lost.
+        """Return pairs (index in ``points``, row of ``frame``) of points that the image shows, although their feature
+        tracks were lost.
 
         ``camera``: the predicted camera pose. ``points``: keys of N points. ``positions`` (N, 3): their estimates.
-        ``rows``: the features of ``frame`` that may be matched.
+        ``rows``: the rows of the features in ``frame`` that may be matched.
         """
         if not len(points) or not rows:
             return []
@@ -118,7 +116,7 @@ class PointViews:
     ) -> PointMap:
         """Return the map ``points`` with all stored views, computed from the final poses of their keyframes.
 
-        ``keys``: the keys of the points. ``values``: final estimates by key, which include the poses of keyframes.
+        ``keys``: the keys of the points. ``values``: final estimates of keyframe poses and other variables, by key.
         ``pose_covariances``: body-frame covariances of these poses by key. The error of a pose is common to all points
         that were observed from it.
         """

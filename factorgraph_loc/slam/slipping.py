@@ -50,10 +50,10 @@ def unless_slipped(
 
 
 def moved_since(keyframes: Mapping[int, Keyframe], newest: Keyframe, t: float, most: int) -> Array | None:
-    """Return the covariance (3, 3) of the odometry since an earlier keyframe until ``newest``, including detected slip.
+    """Return the covariance (3, 3) of the odometry from an earlier keyframe to ``newest``, including detected slip.
 
     The earlier keyframe is the last one at or before the time ``t`` [s], but at most ``most`` keyframes before
-    ``newest``. Returns None if there is no odometry from the keyframe before ``newest``.
+    ``newest``. ``keyframes``: by index. Returns None if ``newest`` has no odometry from its predecessor.
     """
     steps: list[Increment] = []
     while newest.t > t and newest.from_previous is not None and len(steps) < most:
@@ -68,8 +68,8 @@ def moved_since(keyframes: Mapping[int, Keyframe], newest: Keyframe, t: float, m
 def _evidence(
     model: CameraModel, pose: Array, covariances: tuple[Array, Array], observed: tuple[Array, Array, Array, Array]
 ) -> float:
-    """Return the log-likelihood ratio of the second to the first of two ``covariances`` (3, 3) of the predicted
-    ``pose`` (3,), given an image. Returns 0 if too few points agree. ``observed``: see :func:`unless_slipped`."""
+    """Return the log-likelihood ratio of an image for two ``covariances`` (3, 3) of the predicted ``pose`` (3,), the
+    second relative to the first. Returns 0 if too few points agree. ``observed``: see :func:`unless_slipped`."""
     points, pixels, of_points, noise = observed
     agrees = agreeing(model, lifted(model, pose, covariances[1]), points, pixels, noise)
     if np.count_nonzero(agrees) < ENOUGH:

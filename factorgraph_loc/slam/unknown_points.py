@@ -75,7 +75,8 @@ class _NewImage:
 
 
 class UnknownPoints(Mapper):
-    """Adds the points of images to a graph as variables. ``estimated``: the estimated constants of the camera."""
+    """Adds the points of images to a graph as variables. ``estimated``: which constants of the camera the graph
+    estimates."""
 
     def __init__(self, model: CameraModel, diagnostics: Diagnostics, estimated: Estimated = NOTHING) -> None:
         self.model, self.diagnostics, self.estimated = model, diagnostics, estimated
@@ -102,11 +103,9 @@ class UnknownPoints(Mapper):
         addition: Addition,
         movers: MovingThings,
     ) -> Guess:
-        """Add ``rows`` of the image ``m`` of a new keyframe to the graph. Returns ``guess``, corrected by points.
-
-        The covariance of the pose is not reduced, because the points are as uncertain as the poses that observed them.
-        ``addition``: receives the new factors and variables. ``movers``: the feature tracks on moving objects.
-        """
+        """Add ``rows`` of the image ``m`` of a new keyframe to the graph. Returns ``guess``, with the pose corrected by
+        points. Its covariance is not reduced, because the points are as uncertain as the poses that observed them.
+        ``addition``: receives the new factors and variables. ``movers``: the feature tracks on moving objects."""
         model = self.model
         constants = graph.mapped_constants
         if constants is not None:
@@ -126,8 +125,8 @@ class UnknownPoints(Mapper):
         return self._cameras.at_stamp(keyframe.index, (pose, guess[1]), graph)
 
     def _chosen(self, image: _NewImage, rows: Sequence[int], names: Sequence[Hashable]) -> ChosenSightings:
-        """Return some of the ``rows`` of the image, spread over the whole image. ``names``: the name of each row's
-        point."""
+        """Return the observations of some of the ``rows`` of the image, distributed over the whole image. ``names``:
+        the name of each row's point."""
         priority = [len(names) if name in self._points else self._new.count(name) for name in names]
         pixels = np.asarray(image.m.pixels[list(rows)], dtype=float)
         chosen = spread_out(pixels, PER_KEYFRAME + MOST_WAITING, priority).tolist()
@@ -138,8 +137,8 @@ class UnknownPoints(Mapper):
     def _observe_points(
         self, image: _NewImage, guess: Guess, chosen: ChosenSightings, certain: set[int]
     ) -> tuple[Guess, int]:
-        """Add the observations ``chosen`` of points that the graph contains. Returns the pose ``guess``, corrected by
-        these points, and their number. ``certain``: the rows of points that a loop closure recognized."""
+        """Add the observations ``chosen`` of points that the graph contains. Returns ``guess`` with the pose corrected
+        by these points, and the number of points. ``certain``: the rows of points that a loop closure recognized."""
         m, keyframe = image.m, image.keyframe
         old = [i for i, name in enumerate(chosen.names) if name in self._points]
         old = [old[i] for i in spread_out(chosen.pixels[old], PER_KEYFRAME).tolist()]
@@ -159,10 +158,8 @@ class UnknownPoints(Mapper):
         self, image: _NewImage, guess: Guess, chosen: ChosenSightings, most: int, movers: MovingThings
     ) -> Array:
         """Collect observations of points not in the graph, and add up to ``most`` triangulated points to the graph.
-
-        Returns the pose (3,) of the keyframe. It is adjusted together with the new points if the points of the graph do
-        not determine it. ``movers``: the tracks on moving objects.
-        """
+        Returns the pose (3,) of the keyframe, adjusted together with the new points if the graph's points do not
+        determine it. ``movers``: the tracks on moving objects."""
         m, keyframe, graph, addition = image.m, image.keyframe, image.graph, image.addition
         fresh = [i for i, name in enumerate(chosen.names) if name not in self._points]
         for i in fresh:
@@ -192,8 +189,9 @@ class UnknownPoints(Mapper):
         return pose
 
     def _names_of(self, m: Pixels, rows: Sequence[int], camera: CameraPose, graph: Graph) -> list[Hashable]:
-        """Return the name of the point in each row of the image. A feature has the number of the track that first
-        observed its point. Points that their track has lost are searched from ``camera``, and keep their name."""
+        """Return the name of the point in each of the ``rows`` of the image ``m``. For a feature, this is the number of
+        the track that first observed its point. Points with a lost track are searched in the image, seen from
+        ``camera``, and keep their name."""
         if m.frame is None:
             return [m.names[i] for i in rows]
         tracks = m.frame.tracks[list(rows)].tolist()
@@ -215,13 +213,13 @@ class UnknownPoints(Mapper):
         return names
 
     def _follow(self, track: Hashable, name: Hashable) -> None:
-        """Store that the feature track ``track`` shows the point ``name``, and that no other track shows this point."""
+        """Store that the feature track ``track`` observes the point ``name``, and that no other track does."""
         self._names_by_track = {new_track: of for new_track, of in self._names_by_track.items() if of != name}
         self._names_by_track[track] = name
 
     def _revisited(self, image: _NewImage, guess: Guess, rows: Sequence[int], names: list[Hashable]) -> set[int]:
-        """Return the rows of points that were last observed long ago (loop closure). Their names are written into
-        ``names``."""
+        """Return the set of ``rows`` with points that were last observed long ago (loop closure). Replaces the names of
+        these rows in ``names``. The set is empty if the image closes no loop."""
         frame, t, graph = image.m.frame, image.keyframe.t, image.graph
         if frame is None or not self._loops.is_due(image.m.t):
             return set()
@@ -258,9 +256,9 @@ class UnknownPoints(Mapper):
         keyframe: int,
         guess: Guess,
     ) -> None:
-        """Store the views of the points ``names`` in the ``rows`` of a frame. ``right``: mask of the inliers.
-        ``keyframe``, ``guess``: key and estimate of the keyframe's pose. If an outlier's feature track was joined to
-        the point later, it is separated again."""
+        """Store the views of the points ``names`` in the ``rows`` of a frame. ``right``: mask of the inliers; only
+        these are stored. ``keyframe``, ``guess``: key and estimate of the keyframe's pose. The feature track of an
+        outlier is separated from the point if another track observed the point first."""
         for row, name, agrees in zip(rows, names, right.tolist(), strict=True):
             if agrees:
                 point = self._points[name].key
@@ -269,7 +267,8 @@ class UnknownPoints(Mapper):
                 self._points[name].strikes -= 1  # the track was wrong: this outlier does not count
 
     def leave(self, t: float) -> list[int]:
-        """Remove the points last observed before the time ``t`` [s] from the graph, and return their keys."""
+        """Remove from the graph the points last observed before the time ``t`` [s]. Returns the keys of these
+        points."""
         gone = [point for point in (*self._points.values(), *self._astray) if point.last < t]
         self._points = {name: point for name, point in self._points.items() if point.last >= t}
         self._astray = [point for point in self._astray if point.last >= t]
@@ -284,8 +283,8 @@ class UnknownPoints(Mapper):
         self._new, self._loops = NewPoints(self.model), LoopClosure()
 
     def forget(self, first: Keyframe) -> list[int]:
-        """Delete the data of keyframes before ``first``. Also delete removed points that ``first`` and later keyframes
-        do not observe. Returns the keys of these points."""
+        """Delete the data of keyframes before ``first``. Also delete the points that were removed from the graph and
+        last observed before ``first``, and return their keys."""
         forgotten = [point.key for point in self._gone if point.last < first.t]
         self._gone = [point for point in self._gone if point.last >= first.t]
         self._views.forget(forgotten)
@@ -320,12 +319,9 @@ class UnknownPoints(Mapper):
     def _corrected(
         self, image: _NewImage, points: list[_Point], pixels: Array, guess: Guess, known: Truths
     ) -> tuple[Guess, Array, float, Truths]:
-        """Return the pose ``guess``, corrected by ``points`` of the graph that are observed at ``pixels``. Also returns
-        the tilt (2,) of the robot, the prior standard deviation of the tilt, and a mask of the inliers.
-
-        Recent points and old points are tested separately, because the pose has drifted since the old ones. If too few
-        points agree, only recent ones with names are used. ``known``: mask of points recognized by a loop closure.
-        """
+        """Return ``guess`` with the pose corrected by ``points`` of the graph that are observed at ``pixels``. Also
+        return the tilt (2,) of the robot, the prior standard deviation of the tilt, and a mask of the inliers.
+        ``known``: mask of points recognized by a loop closure, which are inliers."""
         model, keyframe, graph, named = image.model, image.keyframe, image.graph, image.m.names is not None
         sigma = self._floor.sigma
         if not points:
@@ -374,7 +370,8 @@ class UnknownPoints(Mapper):
     def _add_observation(
         self, image: _NewImage, name: Hashable, sighting: PointSighting, agrees: bool, pose: Array
     ) -> None:
-        """Add an observation of the point ``name`` from ``pose`` (3,), or count an outlier if ``agrees`` is False."""
+        """Add an observation of the point ``name`` from ``pose`` (3,) to the graph. If ``agrees`` is False, count an
+        outlier instead."""
         point = self._points[name]
         if not agrees:
             self.diagnostics.reject("camera: point disagrees with the other points of the image")
