@@ -46,7 +46,9 @@ class Notice:
 
 
 def notice(kind: str, sentence: str, *values: object) -> Notice:
-    """Return a :class:`Notice`. ``values``: replace the names in braces in ``sentence``, in order of appearance."""
+    """Return a :class:`Notice`. ``kind``: identifies it for programs. ``sentence``: the text, with names in braces.
+
+    ``values``: replace the names in braces, in order of appearance."""
     names = dict.fromkeys(name for _, name, _, _ in Formatter().parse(sentence) if name)
     numbers = (value.item() if hasattr(value, "item") else value for value in values)
     plainly = (value if isinstance(value, int | float | str) else str(value) for value in numbers)

@@ -32,12 +32,11 @@ def calibrate(
     overwrite: bool = False,
     progress: Callable[[float, float], None] | None = None,
 ) -> calibration.Calibration:
-    """Calibrate a rig, the settings of a robot and its sensors, from logs. Write it and a report; return the
-    calibration.
+    """Return a calibration of a rig, the settings of a robot and its sensors, from logs. Write the rig and a report.
 
-    ``out``: the rig file, ``NAME.rig.toml``; the report is ``NAME.report.html`` next to it. ``rig``, ``world``: replace
-    those of the logs. Either all logs or none must have a reference trajectory. ``progress`` is called with the number
-    of finished steps and the number of all steps.
+    ``out``: the rig file, ``NAME.rig.toml``; the report is ``NAME.report.html`` next to it. ``overwrite``: replace
+    existing files. ``rig``, ``world``: replace those of the logs. Either all logs or none must have a reference
+    trajectory. ``progress`` is called with the number of finished steps and the number of all steps.
     """
     file, page = Path(out), report_beside(Path(out), overwrite=overwrite)
     loaded = load_all(logs, rig, world)
@@ -103,11 +102,11 @@ def features(
     overwrite: bool = False,
     progress: Callable[[float, float], None] = lambda _done, _total: None,
 ) -> pl.DataFrame:
-    """Evaluate point features on ``images`` of planar scenes. Return the scores, and write them to the folder ``out``.
+    """Return scores of point features on ``images`` of planar scenes, and write them to the folder ``out``.
 
     ``images``: folders of image sequences, or photographs. Known homographies warp photographs to image sequences.
-    ``features``: names of the features to compare. ``count``: maximum number of features in an image. ``progress`` is
-    called with the number of finished images and the number of all images.
+    ``features``: names of the features to compare. ``count``: maximum number of features in an image. ``overwrite``:
+    replace existing files. ``progress`` is called with the number of finished images and the number of all images.
     """
     require_free(Path(out), feature_scores.FILES, overwrite=overwrite)
     chosen = [Feature(name, extractor(name, count).detectAndCompute) for name in features]

@@ -118,7 +118,9 @@ def simulate(
 def _write_with_images(
     log: Log, settings: SimulationSettings, seed: int, folder: Path, progress: Callable[[float, float], None]
 ) -> None:
-    """Write a simulated log with rendered images to ``folder``. If rendering fails, nothing is written."""
+    """Write a simulated log with images to ``folder``. The images are rendered from ``settings`` and ``seed``.
+
+    ``progress`` is called with the number of finished images and of all images. If rendering fails, nothing is written."""
     require_new(folder)
     folder.parent.mkdir(parents=True, exist_ok=True)
     with temporary_folder(folder) as rendered:

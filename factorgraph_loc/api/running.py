@@ -91,12 +91,12 @@ def run(
 def run_and_learn(
     log: Log, config: RunConfig, progress: Callable[[float], None] | None = None
 ) -> tuple[RunResult, Knowledge]:
-    """Run an estimator on a log and estimate the rig from the same log. Return the result, and the estimated rig.
+    """Return the result of a run on a log, and the rig that is estimated from the same log.
 
     The rig, the settings of a robot and its sensors, is estimated from the whole log. Therefore only the final
-    trajectory uses the estimated rig, and causal estimates use the given rig. The configuration in the result has the
-    estimated rig as ``learnt_rig``. ``progress`` is called with the fraction of the work that is done. Raises
-    InputError if the log has too little information.
+    trajectory uses the estimated rig, and causal estimates use the given rig. ``config``: the estimator and its
+    settings. The configuration in the result has the estimated rig as ``learnt_rig``. ``progress`` is called with the
+    fraction of the work that is done. Raises InputError if the log has too little information.
     """
     report = progress or (lambda _share: None)
     runs = TURNS + 2

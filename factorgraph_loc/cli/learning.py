@@ -188,7 +188,7 @@ def print_elements(made: Made) -> tuple[str, ...]:
 
 
 def document(made: Made) -> dict[str, Any]:
-    """Return the dictionary that ``--json`` prints for a new map: its elements, a summary and notes."""
+    """Return the dictionary that ``--json`` prints for the new map ``made``: its elements, a summary and notes."""
     from factorgraph_loc.mapping.mapping import LandmarkMap
     from factorgraph_loc.mapping.tag_mapping import MadeTags
 
@@ -246,7 +246,7 @@ def _entries(made: LandmarkMap, verdicts: Mapping[str, str]) -> dict[str, dict[s
 
 
 def _reasons(made: MadeTags) -> dict[str, str]:
-    """Return, by the name of each tag that could not be located, the reason."""
+    """Return {name: reason} of the tags that could not be located."""
     return {name: str(why) for name, why in made.open.items()}
 
 

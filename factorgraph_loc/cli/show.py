@@ -21,7 +21,7 @@ NARROW, PADDING = 18, 2  # characters: minimum width of a wrapped column, paddin
 
 
 def line(text: str = "") -> None:
-    """Print a line on stdout, with non-printable characters escaped."""
+    """Print the line ``text`` on stdout, with non-printable characters escaped."""
     print(plain(text, None), flush=True)
 
 

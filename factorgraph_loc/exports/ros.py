@@ -66,7 +66,9 @@ def write_mcap(log: Log, runs: Sequence[StoredRun], path: Path) -> None:
 
 
 def _sources(log: Log, runs: Sequence[StoredRun], make: "_Maker") -> Iterator[Iterator[Message]]:
-    """Yield iterators over all messages of the log and its runs. The messages of an iterator are in order of time."""
+    """Yield iterators over all messages of the log and its runs. The messages of an iterator are in order of time.
+
+    ``make``: makes the ROS messages."""
     moving = [(run.name, BASE if len(runs) == 1 else f"{run.name}/{BASE}", run.played(), run.final) for run in runs]
     if log.reference is not None:
         moving.append((REFERENCE, f"{REFERENCE}/{BASE}", log.reference, log.reference))
@@ -97,9 +99,10 @@ def _map(log: Log, make: "_Maker") -> list[dict[str, Any]]:
 
 
 def _poses(topic: str, frame: str, trajectory: Trajectory, t0_ns: int, make: "_Maker") -> Iterator[Message]:
-    """Yield two messages for each pose of a trajectory: the transform of ``frame`` on ``/tf``, and the odometry on ``topic``.
+    """Yield two messages for each pose of a trajectory: the transform of ``frame`` on ``/tf``, and odometry on
+    ``topic``.
 
-    Odometry has the covariance of the pose, zero if it is unknown."""
+    Odometry has the covariance of the pose, zero if it is unknown. ``t0_ns``: the absolute time [ns] of t = 0."""
     covariances = np.zeros((len(trajectory), 6, 6))
     if trajectory.covariances is not None:
         known = np.isfinite(trajectory.covariances).all(axis=(1, 2))

@@ -62,7 +62,9 @@ class Cells:
         return [str(cell) for cell in self.columns[name]]
 
     def names(self, name: str, column: Column) -> list[str]:
-        """Return the N names in a field. Raises InputError at the first empty cell. ``column``: describes the field."""
+        """Return the N cells of the field ``name``, which are names. Raises InputError at the first empty cell.
+
+        ``column``: the description of the field."""
         texts, faults = self._names(name, column)
         self.require(faults)
         return texts
@@ -141,7 +143,7 @@ class Cells:
                 raise fault.error(self.path, self.rows, self.rules.skipping if self.rules and is_few else "")
 
     def fault(self, name: str, wrong: NDArray[np.bool_], expected: str) -> Fault:
-        """Return the invalid cells of a field. ``wrong`` (N,): mask of them. ``expected``: describes valid cells."""
+        """Return the invalid cells of the field ``name``. ``wrong`` (N,): mask of them. ``expected``: describes valid cells."""
         return Fault(self.labels.get(name, name), self.columns[name], wrong, expected)
 
     def _faults(self, name: str, column: Column) -> Sequence[Fault]:
@@ -209,7 +211,7 @@ class Cells:
         return np.array(stamps, dtype=np.int64), [self.fault(name, wrong, expected)]
 
     def invalid(self, name: str, i: int, expected: str) -> InputError:
-        """Return the error for the invalid cell ``i`` of a field. ``expected``: a description of valid cells."""
+        """Return the error for the invalid cell ``i`` of the field ``name``. ``expected``: a description of valid cells."""
         return bad_field(self.path, self.labels.get(name, name), self.columns[name][i], expected, row=int(self.rows[i]))
 
     def _floats(self, texts: Sequence[Any]) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:

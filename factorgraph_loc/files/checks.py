@@ -56,8 +56,8 @@ def increments_in_order(
 
     ``moves`` (N, 3 or 4): x, y [m] and heading [rad] since the previous row, in the body frame of that row. The
     optional fourth column is the part [s] of this time without odometry. Increments with equal timestamps ``t_ns`` (N,)
-    are composed, with a warning in ``warnings``. ``rows`` (N,): row numbers in the file ``source``. Raises InputError
-    if the timestamps decrease.
+    are composed, with a warning in ``warnings``. ``rows`` (N,): row numbers in the file ``source``. ``rules``: if
+    given, errors name the key that sorts the rows. Raises InputError if the timestamps decrease.
     """
     _require_order(source, rows, t_ns, rules)
     last, out = composed(t_ns, moves[:, :3])
@@ -127,8 +127,9 @@ def last_in_order(
     """Return the indices (M,) of the rows to use. Of rows with equal timestamps ``t_ns`` (N,), only the last is used.
 
     ``names``: the landmark of each row. If given, rows with equal timestamps and different landmarks are all used.
-    ``rows`` (N,): row numbers in the file ``source``. Rows out of order add a warning to ``warnings``. Raises
-    InputError if a timestamp is more than 0.5 s older than a previous one.
+    ``rows`` (N,): row numbers in the file ``source``. ``rules``: if given, errors name the key that sorts the rows.
+    Unsorted rows add a warning to ``warnings``. Raises InputError if a timestamp is over 0.5 s older than a previous
+    one.
     """
     arrivals(source, rows, t_ns, warnings, rules)
     keys: Iterable[Hashable] = t_ns.tolist() if names is None else zip(t_ns.tolist(), names, strict=True)

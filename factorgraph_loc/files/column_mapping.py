@@ -121,9 +121,9 @@ def _mapped(
     passed: int = 0,
     unread: tuple[tuple[int, str], ...] = (),
 ) -> Cells:
-    """Return the cells of a file by field. ``columns``: the cells by column name. ``available``: all column names.
+    """Return the cells of a file by field, as ``mapping`` assigns them. ``columns``: {column: the cells of N rows}.
 
-    ``unwanted``, ``passed`` and ``unread`` become fields of the :class:`Cells`."""
+    ``rows`` (N,): line numbers. ``available``: all column names. The other arguments become fields of the cells."""
     fields = {field: columns[name] for field, name in mapping.columns.items() if name in columns}
     read = {*mapping.columns.values(), *mapping.where}
     left_out = tuple(name for name in available if name not in read)
@@ -133,7 +133,7 @@ def _mapped(
 
 
 def _rules(mapping: ColumnMapping) -> RowRules | None:
-    """Return the rules for invalid rows of a mapped table, or None for tables of names and maps."""
+    """Return the rules for invalid rows of a table with timestamps. Returns None for other tables, such as maps."""
     return mapping if isinstance(mapping, TimedMapping) else None
 
 

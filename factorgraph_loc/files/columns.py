@@ -233,7 +233,7 @@ def within(name: str, units: Mapping[str, float], most: float, doc: str) -> Colu
 
 
 def named(name: str, doc: str, kind: Literal["name", "file"] = "name", *, field: str = "") -> Column:
-    """Return the :class:`Column` ``name`` of names or of paths of files. ``doc``: its meaning.
+    """Return the :class:`Column` ``name`` of names, or of paths if ``kind`` is "file". ``doc``: its meaning.
 
     ``field``: the attribute of a ``Stream`` with its values, by default ``name``."""
     return Column(name, kind, {}, 0.0, math.inf, False, doc, field)

@@ -219,7 +219,9 @@ def read_table(path: Path, tables: Sequence[Table], rules: RowRules, warnings: l
 
 
 def _cells_of_parquet(path: Path, tables: Sequence[Table], rules: RowRules | None) -> tuple[Cells, tuple[Column, ...]]:
-    """Read a Parquet file that contains one of ``tables``. Return its cells and the columns of that table."""
+    """Return the cells of a Parquet file that contains one of ``tables``, and the columns of that table.
+
+    ``rules``: whether invalid rows are skipped, and rows sorted by time. They become a field of the cells."""
     frame = read_parquet(path)
     columns = columns_in(path, frame.columns, tables)
     cells: dict[str, Any] = {}

@@ -286,7 +286,7 @@ def _add_sizes(settings: dict[str, Any], table: Guess, sides: Sequence[str], rol
 
 
 def _reference(roles: _Roles, path: Path) -> Trajectory | None:
-    """Return the reference trajectory in the folder ``path``, or None if there is none, or if it cannot be read."""
+    """Return the reference trajectory in ``roles``, or None if there is none, or if it cannot be read. ``path``: its folder."""
     if (table := roles.tables.get("reference")) is None:
         return None
     with suppress(InputError):
@@ -326,7 +326,9 @@ def _turns_of(reference: Trajectory) -> Turns:
 
 
 def _turns(role: str, roles: _Roles, path: Path) -> Turns | None:
-    """Return the headings over time in the table with the ``role``, such as "odometry", or None without headings."""
+    """Return the headings over time in the table ``roles.tables[role]``. Returns None if it has no headings.
+
+    ``path``: the folder of the tables."""
     table = roles.tables[role]
     if role == "reference":
         reference = _reference(roles, path)

@@ -37,10 +37,10 @@ def proposal_of(
 ) -> Proposal:
     """Return a proposed manifest of the log at ``path``. A manifest is a TOML file that describes how to read a log.
 
-    ``reader``, ``options``: the reader of the log and its options. ``folder``: the folder to save the manifest in. If
-    the log is not below it, the folder that contains the log is used. A rig file and a world file next to the log are
-    named in the manifest. If one is missing, a remark asks for it. ``with_map``: False if ``options`` describe the map,
-    so that no world file is needed.
+    ``reader``, ``options``: the reader of the log and its options. ``remarks``: comments for the manifest. ``folder``:
+    the folder to save the manifest in. If the log is not below it, the folder that contains the log is used. A rig file
+    and a world file next to the log are named in the manifest. If one is missing, a remark asks for it. ``with_map``:
+    False if ``options`` describe the map, so that no world file is needed.
     """
     root = folder if path.is_relative_to(folder) else path.parent
     kind = "bag" if reader == "rosbag" else "folder"

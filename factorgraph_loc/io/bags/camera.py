@@ -167,7 +167,7 @@ class Info:
 
 
 def netpbm(image: Any, where: str) -> tuple[bytes, str]:
-    """Convert an uncompressed ``sensor_msgs/Image`` to a Netpbm file. Returns the content and the suffix of the file.
+    """Return an uncompressed ``sensor_msgs/Image`` as the content and the suffix of a Netpbm file.
 
     ``where``: names the message in errors. Raises InputError if the encoding is not supported or pixels are missing.
     """

@@ -77,9 +77,9 @@ class Uses:
     remarks: list[str] = field(default_factory=list)
 
     def take(self, sensor: str, topics: Sequence[Topic], **settings: Any) -> None:
-        """Propose the first of ``topics`` for a sensor. ``settings``: further options of this sensor.
+        """Propose the first of ``topics`` for a sensor, such as "imu". ``settings``: further options of this sensor.
 
-        If ``topics`` has several topics, a remark lists the rest. Does nothing if ``topics`` is empty.
+        If there are more topics, a remark lists them as alternatives. Does nothing if ``topics`` is empty.
         """
         if topics:
             self.options[sensor] = {"topic": topics[0].name, **settings}

@@ -64,9 +64,10 @@ class WheelSettings(motions.WheelSizes):
 
 
 class JointRows:
-    """Collects the angles or angular velocities of W wheels from a topic with JointState messages.
+    """Collects the angles or angular velocities of W wheels from a ``topic`` with JointState messages.
 
-    ``column``: the field of the message to read, ``position`` or ``velocity``.
+    ``wheels``: the names of the joints. ``column``: the field of the message to read, ``position`` or ``velocity``.
+    ``rules``: whether invalid rows are skipped, and rows sorted by time.
     """
 
     def __init__(self, bag: Bag, topic: str, wheels: WheelSettings, column: str, rules: RowRules) -> None:
@@ -235,7 +236,8 @@ def _velocities(rows: TopicRows, warnings: list[Notice]) -> tuple[Integers, Arra
 def _of_poses(listeners: Listeners, options: OdometryTopic, static: StaticFrames) -> Motion:
     """Register a collector of poses or tf at ``listeners``. Return a function that computes odometry from them.
 
-    The function returns timestamps (N,) [ns] and increments (N, 3 or 4). ``static``: the static transforms of the bag.
+    ``options``: the topic. ``static``: the static transforms of the bag. Call the function with a list that receives
+    warnings. It returns timestamps (N,) [ns] and increments (N, 3 or 4).
     """
     made = poses_of_topic(listeners, options, static)
 

@@ -126,7 +126,7 @@ add_fields(
 def read(path: Path | None, options: Options) -> Log:
     """Return the log in the bag ``path``. Its t = 0 is the time of the first odometry message.
 
-    Raises InputError with the bag, topic, message and field of an invalid value.
+    ``options``: the topic of each sensor. Raises InputError with the bag, topic, message and field of an invalid value.
     """
     if path is None:
         raise InputError("rosbag: the path of the bag is missing")

@@ -57,7 +57,7 @@ class RowTopic(TopicSettings, RowRules):
 class Fields:
     """Extracts the values of some fields from the messages of a topic.
 
-    ``paths``: the path of each field by its name. ``names``: the names of the fields. Raises InputError if a path is unknown.
+    ``paths``: {name of a field: its path in the message}. ``names``: the names. Raises InputError if a path is unknown.
     """
 
     def __init__(self, bag: Bag, topic: Topic, paths: Mapping[Any, str]) -> None:

@@ -197,7 +197,9 @@ def _from_file(log: str, path: Path, data_root: str | Path | None) -> _Source:
 
 
 def _from_manifest(file: Path, data_root: str | Path | None) -> _Source:
-    """Return the source that the manifest in ``file`` describes. Raises InputError if its data do not exist."""
+    """Return the source that the manifest in ``file`` describes. ``data_root``: the data folder, by default FGLOC_DATA.
+
+    Raises InputError if the data of the manifest do not exist."""
     manifest = read_manifest(file)
     path = None
     if manifest.path is not None:

@@ -157,7 +157,7 @@ def _concatenated(path: Path, tables: Sequence[TableRows]) -> TableRows:
 
 
 def read_reads(folder: TableFolder, path: Path, options: RfidFile) -> TableRows:
-    """Return the RFID reads of one file, sorted by time.
+    """Return the RFID reads of one file, sorted by time. ``options``: describe its columns.
 
     A row that summarizes several reads gives two: the first, with the measured values, and the last.
     ``folder.warnings`` receives warnings. Raises InputError with file, row and column of an invalid value.
