@@ -29,9 +29,11 @@ System = tuple[Array, Array, Array, Array]
 
 @compiled
 def normal(count: int, first: Integers, jacobian: Array, residual: Array) -> System:
-    """Return the normal equations of ``count`` poses and P parameters, from M residuals (M,), see :data:`System`.
+    """Return the normal equations of ``count`` (N) poses and P parameters, from M residuals (M,).
     ``first`` (M,): the index of the first pose that each residual depends on. ``jacobian`` (M, 6 + P): the derivatives
-    of the residuals with respect to this pose, the next pose, and the parameters."""
+    of the residuals with respect to this pose, the next pose, and the parameters. The four results are blocks of the
+    information matrix. They are each pose with itself (N, 3, 3), with the next pose (N, 3, 3), with the parameters (N,
+    3, P + 1), and the parameters (P + 1, P + 1). The last column of the latter two is the gradient."""
     shared = jacobian.shape[1] - 2 * POSE
     own, coupling = np.zeros((count, POSE, POSE)), np.zeros((count, POSE, POSE))
     side, corner = np.zeros((count, POSE, shared + 1)), np.zeros((shared + 1, shared + 1))
@@ -125,7 +127,8 @@ def _eliminated(system: System, damping: float) -> tuple[bool, Array, Array, Arr
 
 @compiled
 def solved(system: System, damping: float) -> tuple[bool, Array, Array]:
-    """Solve the normal equations ``system`` for one damped step. The diagonal is multiplied by ``1 + damping``.
+    """Solve the normal equations ``system``, from :func:`normal`, for a step. Their diagonal is multiplied by ``1 +
+    damping``.
 
     Returns three values: True if the poses are determined, the step of the poses (N, 3), and the step of the parameters
     (P,). The steps are zero if the first value is False. Raises LinAlgError if the parameters are not determined.
@@ -153,9 +156,9 @@ def solved(system: System, damping: float) -> tuple[bool, Array, Array]:
 
 @compiled
 def covariances(system: System) -> tuple[bool, Array, Array]:
-    """Invert the information matrix of the normal equations ``system``. Returns True if the poses are determined, the
-    covariances of the poses (N, 3, 3), and the covariance of the parameters (P, P). Raises LinAlgError if the
-    parameters are not determined."""
+    """Invert the information matrix of the normal equations ``system``, the result of :func:`normal`. Returns True if
+    the poses are determined, the covariances of the poses (N, 3, 3), and the covariance of the parameters (P, P).
+    Raises LinAlgError if the parameters are not determined."""
     solvable, out, by_next, by_side, left = _eliminated(system, 0.0)
     shared = len(left) - 1
     if not solvable:

@@ -159,7 +159,7 @@ def predicted(covariance: Array, transition: Array, noise: Array) -> Array:
 
 @compiled
 def smoothed(covariance: Array, transition: Array, noise: Array, change: Array, later: Array) -> tuple[Array, Array]:
-    """Compute one backward step of the smoother of Rauch, Tung and Striebel (1965).
+    """Return the results of one backward step of the smoother of Rauch, Tung and Striebel (1965).
 
     ``covariance`` (S, S): covariance of the filtered state.
     ``transition`` (R, S), ``noise`` (R, R): the prediction step that follows the filtered state, as in

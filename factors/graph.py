@@ -37,33 +37,33 @@ _CHARACTER = 56  # number of bits of a key below the character, which denotes th
 
 
 def pose_key(index: int) -> int:
-    """Return the key of the pose of keyframe ``index``."""
+    """Return the GTSAM key of the pose of keyframe ``index``."""
     return int(gtsam.symbol("x", index))
 
 
 def tilt_key(index: int) -> int:
-    """Return the key of the robot's roll and pitch at keyframe ``index``."""
+    """Return the GTSAM key of the robot's roll and pitch at keyframe ``index``."""
     return int(gtsam.symbol("t", index))
 
 
 def constants_key(index: int) -> int:
-    """Return the key of the estimated constants of sensor number ``index``."""
+    """Return the GTSAM key of the estimated constants of sensor number ``index``."""
     return int(gtsam.symbol("c", index))
 
 
 def landmark_key(index: int) -> int:
-    """Return the key of landmark number ``index``, in order of first detection."""
+    """Return the GTSAM key of landmark number ``index``, in order of first detection."""
     return int(gtsam.symbol("l", index))
 
 
 def point_key(index: int) -> int:
-    """Return the key of point number ``index`` in space, in order of addition to the graph."""
+    """Return the GTSAM key of point number ``index`` in space, in order of addition to the graph."""
     return int(gtsam.symbol("p", index))
 
 
 def leaving_key(index: int) -> int:
-    """Return the key of auxiliary variable number ``index``. A fixed-lag smoother marginalises such a variable in the
-    same update that adds it."""
+    """Return the GTSAM key of auxiliary variable number ``index``. A fixed-lag smoother marginalises such a variable in
+    the same update that adds it."""
     return int(gtsam.symbol("q", index))
 
 
@@ -163,8 +163,8 @@ def jacobian_factors(
 ) -> list[gtsam.GaussianFactor]:
     """Linearise factors. Returns linear factors of GTSAM in the same order.
 
-    ``factors``: tuples of a factor, the keys of its variables, and its number of residuals. The number is needed only
-    with ``on_failure``.
+    ``factors``: tuples (factor, keys of its variables) or (factor, keys, number of its residuals). The number is needed
+    only with ``on_failure``.
     ``values``: the value of each variable by key.
     ``on_failure``: is called with the reason if a residual or Jacobian is not finite or has a wrong shape. The linear
     factor is then zero. If ``on_failure`` is None, nothing is checked.

@@ -39,7 +39,7 @@ def minima(
     moved: Callable[[Array, Array], Array] = np.add,
     largest: Array | float = np.inf,
 ) -> Minima:
-    """Find local minima of N independent costs.
+    """Return the local minima of N independent costs, found by Newton-like steps from initial states.
 
     ``at(states, which)``: returns costs (n,), gradients (n, D) and curvatures (n, D, D) of the costs with indices
     ``which`` (n,). The curvature is the Fisher information or the Gauss-Newton approximation of the Hessian.
@@ -80,10 +80,11 @@ def minimum(
     low: Array | float = -np.inf,
     high: Array | float = np.inf,
 ) -> tuple[Array, float, Array]:
-    """Find a local minimum of one cost within the bounds ``low`` and ``high``, scalars or (D,).
+    """Return the state (D,), the cost and the curvature (D, D) at a local minimum of one cost.
 
-    ``at(state)``: returns the cost, gradient (D,) and curvature (D, D). The remaining arguments are those of
-    :func:`minima`. Returns the state (D,), the cost and the curvature (D, D) at the minimum.
+    ``at(state)``: returns the cost, gradient (D,) and curvature (D, D). ``start`` (D,): initial state. ``iterations``:
+    their maximum number. A step of at most ``converged`` ends the search. A step above ``largest`` is shortened.
+    ``low``, ``high``: bounds of the state. The last four are scalars or (D,).
     """
 
     def only(states: Array, _: Integers) -> tuple[Array, Array, Array]:

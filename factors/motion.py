@@ -50,7 +50,7 @@ class ChainState(NamedTuple):
 
 
 def propagate(covariance: Array, increment: Increment) -> Array:
-    """Return the body-frame covariance (3, 3) of a pose after a motion. ``covariance`` (3, 3): before the motion."""
+    """Return the body-frame covariance (3, 3) of a pose after a motion, from the ``covariance`` (3, 3) before it."""
     return np.asarray(carried(covariance, increment.delta, increment.covariance))
 
 
@@ -74,7 +74,7 @@ def poses_between(
     its body-frame covariance, and its duration.
     ``steps`` (M-1, 3), ``step_noises`` (M-1, 3, 3), ``step_durations`` (M-1,) [s]: the same from each estimated pose to
     the next estimated pose.
-    ``elsewhere`` (M-1,): True if a person carried the robot to the next pose. Times before that pose then ignore it.
+    ``elsewhere`` (M-1,): True if a person carried the robot to the next pose. Only the previous pose is used then.
     ``poses`` (M, 3), ``covariances`` (M, 3, 3): the estimated poses and their body-frame covariances.
 
     The error of the odometry between two estimated poses is distributed in proportion to time.

@@ -105,9 +105,9 @@ def squared(errors: Array, covariances: Array) -> Array:
 
 
 def smoothed(covariance: Array, transition: Array, noise: Array, change: Array, later: Array) -> tuple[Array, Array]:
-    """Run one backward step of the smoother of Rauch, Tung and Striebel, also for nearly singular covariances.
-    Arguments and results are those of :func:`factors.gaussian.smoothed`. If that function fails, the smoothed
-    covariance is computed in Joseph's form, which is positive semi-definite for any gain."""
+    """Return the correction (S,) of a state and its smoothed covariance (S, S), as :func:`factors.gaussian.smoothed`
+    does with the same arguments, also for nearly singular covariances. If that function fails, the smoothed covariance
+    is computed in Joseph's form, which is positive semi-definite for any gain."""
     arrays = (np.ascontiguousarray(part, dtype=float) for part in (covariance, transition, noise, change, later))
     try:
         correction, smoothed_covariance = gaussian.smoothed(*arrays)
@@ -129,7 +129,7 @@ def worst_sigma(covariances: Array) -> Array:
 
 
 def draws(covariance: Array, count: int, rng: np.random.Generator) -> Array:
-    """Draw ``count`` samples (count, D) from a zero-mean Gaussian whose covariance (D, D) may be singular."""
+    """Return ``count`` random samples (count, D) of a zero-mean Gaussian whose covariance (D, D) may be singular."""
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     return np.asarray(rng.standard_normal((count, len(values))) @ root.T)

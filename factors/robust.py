@@ -19,13 +19,13 @@ Squared = TypeVar("Squared", float, Array)
 @register_jitable(inline="always")
 def geman_mcclure_loss(squared: Squared, scale: float) -> Squared:
     """Return the loss of Geman and McClure (1985) for ``squared``, the squared norms of whitened residuals. It is at
-    most ``scale^2 / 2``, so that gross outliers have no influence. ``scale``: in standard deviations."""
+    most ``scale^2 / 2``, so that gross outliers have no influence. ``scale``: a number of standard deviations."""
     return 0.5 * squared / (1.0 + squared / scale**2)
 
 
 @register_jitable(inline="always")
 def geman_mcclure_weight(squared: Squared, scale: float) -> Squared:
-    """Return the weights in iteratively reweighted least squares with :func:`geman_mcclure_loss`. Same arguments."""
+    """Return the weights in iteratively reweighted least squares with :func:`geman_mcclure_loss`, same arguments."""
     return (1.0 + squared / scale**2) ** -2
 
 
@@ -41,6 +41,7 @@ def huber_loss(squared: Squared, scale: float) -> Squared:
 
 @register_jitable(inline="always")
 def huber_weight(squared: Squared, scale: float) -> Squared:
-    """Return the weights in iteratively reweighted least squares with :func:`huber_loss`. Same arguments."""
+    """Return the weights in iteratively reweighted least squares with :func:`huber_loss`. The arguments are the
+    same."""
     weight: Squared = scale / np.maximum(np.sqrt(squared), scale)
     return weight

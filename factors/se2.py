@@ -300,8 +300,8 @@ def body_to_world_one(pose: Array, covariance: Array) -> Array:
 
 @compiled(error_model="numpy", fastmath={"arcp", "contract", "reassoc"})
 def all_moved(poses: Array, delta: Array, twists: Array) -> Array:
-    """Return ``poses * delta * exp(twists)`` (N, 3): N poses, each moved by the common motion ``delta`` (3,) and then
-    by its own twist (N, 3)."""
+    """Return ``poses * delta * exp(twists)`` (N, 3): ``poses`` (N, 3), each moved by the common motion ``delta`` (3,)
+    and then by its own twist in ``twists`` (N, 3)."""
     out, cd, sd = np.empty_like(poses), math.cos(delta[2]), math.sin(delta[2])
     for n in range(len(poses)):
         c, s = math.cos(poses[n, 2]), math.sin(poses[n, 2])

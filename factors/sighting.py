@@ -29,10 +29,10 @@ class SightingFactor(Protocol):
 
 
 def delayed(offset: Array | None, twist: Array | None, seconds: float) -> Array | None:
-    """Correct the relative pose ``offset`` (3,) for a measurement that was made ``seconds`` later.
+    """Return the robot's pose ``seconds`` after the pose ``offset`` (3,), in the same frame.
 
-    ``offset``: the robot's pose at the time of the measurement, in the frame of the estimated pose. None if both poses
-    are equal. ``twist`` (3,): the robot's velocity in the body frame. If it is None, the offset is returned unchanged.
+    ``offset``: the robot's pose at the time of a measurement, in the frame of the estimated pose. None if both poses
+    are equal. ``twist`` (3,): the robot's velocity in the body frame. If it is None, ``offset`` is returned unchanged.
     """
     if twist is None or seconds == 0.0:
         return offset

@@ -83,7 +83,8 @@ class ReprojectionFactor:
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Return the whitened residual (2K,) of K pixels and its Jacobian (2K, d) by each variable of size d.
         ``values``: the pose (3,), then the estimated constants and displacements, see the class. Residual and Jacobians
-        include robust weights and tempering. Their noise includes the variances of the robot's roll and pitch."""
+        include robust weights and tempering. The noise used to whiten them includes the robot's unknown roll and
+        pitch."""
         if self.of_pose_alone:
             residual, jacobian = pixel_kernels.linearized(self.packed(), np.ascontiguousarray(values[0], dtype=float))
             return residual, [jacobian]
@@ -169,7 +170,7 @@ def image_update(
     values: Sequence[Array] = (),
     columns: Sequence[slice] = (),
 ) -> Correction:
-    """Correct the Gaussian estimate of a robot pose by known points in an image, with an iterated Kalman update.
+    """Correct the Gaussian estimate of a robot pose by the image points of ``factor``, with an iterated Kalman update.
 
     ``pose`` (3,): the predicted pose.
     ``covariance`` (S, S): covariance of the error state. Its first three components are the pose's body-frame
@@ -177,8 +178,8 @@ def image_update(
     ``values``: the predicted values of the factor's variables except the pose. ``columns``: for each of these
     variables, the slice of its components in the error state.
 
-    Returns the correction of the error state, the new covariance and statistics. With ``values``, the new covariance is
-    in the body frame of the updated pose instead of the predicted pose. See :func:`~factors.update.update_state`.
+    Returns the correction (S,) of the error state, the new covariance (S, S) and statistics as one object. The new
+    covariance is in the body frame of the predicted pose. With ``values``, it is in that of the updated pose.
     """
     size = len(covariance)
     packed = factor.packed() if factor.of_pose_alone else None

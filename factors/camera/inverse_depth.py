@@ -33,8 +33,8 @@ def directions(rays: Array) -> tuple[Array, Array]:
 
 
 def turned(angles: Array) -> Array:
-    """Return the derivative (2, 3) of azimuth and elevation by a small rotation vector about the world's axes.
-    ``angles`` (2,): azimuth and elevation [rad]."""
+    """Return the derivative (2, 3) of a direction's azimuth and elevation by a small rotation vector about the world's
+    axes. ``angles`` (2,): azimuth and elevation [rad] of the direction."""
     azimuth, elevation = angles.tolist()
     c, s = np.cos(azimuth), np.sin(azimuth)
     slope = np.tan(elevation)
@@ -58,7 +58,7 @@ def linearize(model: CameraModel, position: Array, rotation: Array, rays: Array)
     are given as ``rays`` (K, 6): x, y, z of the start, azimuth, elevation, inverse depth.
 
     Returns the pixels (K, 2) and their Jacobians by the camera's perturbation (K, 2, 6) and by the rays (K, 2, 6). The
-    perturbation is that of :func:`~factors.camera.model.linearize_in_space`. A pixel depends only on the direction from
+    perturbation is in the camera frame, with rotation before translation. A pixel depends only on the direction from
     the camera to the point, so the inverse depth may be zero.
     """
     ahead, by_angles = directions(rays)
@@ -78,11 +78,11 @@ def linearize(model: CameraModel, position: Array, rotation: Array, rays: Array)
 def begin(
     model: CameraModel, position: Array, rotation: Array, pixel: Array, inverse_depth: float
 ) -> tuple[Array, Array, Array]:
-    """Initialise the ray of a point from its first ``pixel`` (2,) and an assumed ``inverse_depth`` [1/m].
+    """Return the ray of a new point from its first ``pixel`` (2,) and an assumed ``inverse_depth`` [1/m].
 
     ``position`` (3,), ``rotation`` (3, 3): the camera's pose in the world. Returns the ray (6,): camera position,
     azimuth, elevation, inverse depth. Also returns its Jacobians by the perturbation (6, 6) of the camera's pose, and
-    by pixel and inverse depth (6, 3).
+    by pixel and inverse depth (6, 3). The perturbation is in the camera frame, with rotation before translation.
     """
     (local,) = rays(model, pixel[None])
     _, _, by_local = linearize_in_space(model, np.zeros(3), np.eye(3), local[None])

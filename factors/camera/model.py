@@ -92,7 +92,8 @@ class CameraModel:
         return gtsam.Cal3DS2(self.fx, self.fy, 0.0, self.cx, self.cy, *self.distortion)
 
     def contains(self, pixels: Array, margin: float = 0.0) -> Any:
-        """Return a mask (...) of ``pixels`` (..., 2) in the image, or at most ``margin`` pixels outside of it."""
+        """Return a mask (...), True where ``pixels`` (..., 2) are in the image or at most ``margin`` [px] outside of
+        it."""
         u, v = pixels[..., 0], pixels[..., 1]
         inside = (u >= -0.5 - margin) & (u <= self.width - 0.5 + margin)
         return inside & (v >= -0.5 - margin) & (v <= self.height - 0.5 + margin)
@@ -195,7 +196,8 @@ def rays(model: CameraModel, pixels: Array) -> Array:
 
 
 def folded(model: CameraModel) -> Array | None:
-    """Return a pixel (2,) at which the lens model is not invertible, or None. Checks a grid of pixels over the image.
+    """Return a pixel (2,) at which the lens model is not invertible, or None. The pixels of a grid over the image are
+    checked.
 
     A lens is invertible at a pixel if a direction within the valid radius projects to the pixel, with a positive
     determinant of the lens's Jacobian.

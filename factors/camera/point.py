@@ -21,7 +21,7 @@ from factors.se2 import Array
 class PointFactor:
     """The pixel of one point as a factor on the robot's pose, the robot's tilt and the point's position.
 
-    ``lens``: the constants of ``model`` for compiled code, from :func:`~factors.camera.model.lens_of`.
+    ``model``: the camera. ``lens``: its constants for compiled code, from :func:`~factors.camera.model.lens_of`.
     ``pixel`` (2,): the measured pixel of the point.
     ``estimated``: indices in :data:`~factors.camera.model.PARAMETERS` of the P camera constants that are estimated.
     ``twist`` (3,): the robot's body-frame velocity. Needed if the time offset is estimated.
@@ -98,7 +98,8 @@ def _linearize_all(factors: Sequence[PointFactor], values: Sequence[Sequence[Arr
 
 
 def _later(factors: Sequence[PointFactor], values: Sequence[Sequence[Array]]) -> tuple[Array, Array]:
-    """Return the robot's velocities (N, 3) at N factors, and its motions (N, 3) during the estimated time offset."""
+    """Return the robot's velocities (N, 3) at N factors, and its motions (N, 3) during the estimated time offset.
+    ``values``: the variables of each factor."""
     twists = np.array([f.twist for f in factors], dtype=float)
     seconds = float(values[0][1][factors[0].estimated.index(TIME_OFFSET)])
     return twists, se2.exp(seconds * twists)
@@ -111,7 +112,7 @@ class PointPrior:
     ``mean`` (3,) [m]: the expected position in the robot frame. ``sigma`` [m]: the standard deviation of each
     coordinate. The methods take ``values``, a list of the robot's pose (3,) and the point (3,) in the world.
 
-    A prior in the world frame would constrain the robot: a thousand priors with 30 m would fix its position to a metre.
+    A prior in the world frame would constrain the robot: a thousand, each of 30 m, would fix its position to a metre.
     """
 
     mean: Array

@@ -40,8 +40,8 @@ def triangulated(
     its covariance (3, 3), and the squared norms (M,) of its whitened residuals. The norms are infinite if the point is
     not at least ``nearest`` in front of all cameras.
 
-    The start is the point nearest to all rays. Gauss-Newton steps on the reprojection error follow (Hartley and
-    Zisserman, "Multiple View Geometry", 2004, chapter 12).
+    The initial estimate is the point nearest to all rays. Gauss-Newton steps then reduce the reprojection error
+    (Hartley and Zisserman, "Multiple View Geometry", 2004, chapter 12).
     """
     directions = np.empty_like(rays)
     for m in range(len(rays)):
@@ -71,12 +71,12 @@ def triangulated(
 
 @compiled(error_model="numpy")
 def inverse_depths(first: Array, second: Array, position: Array, motion: Array) -> Array:
-    """Triangulate K points from two images. Returns their inverse depths (K,) [1/m] in the first image, at the point of
-    the first ray that is nearest to the second ray.
+    """Return the inverse depths (K,) [1/m] of K points in the first of two images. The depth of a point is that of the
+    point on the first ray that is nearest to the second ray.
 
-    ``first``, ``second`` (K, 3): viewing rays at each image along the robot's axes, scaled to depth 1 in the camera.
-    ``position`` (3,): position of the camera in the robot frame. ``motion`` (3,): the robot's pose at the second image
-    in the frame of its pose at the first image.
+    ``first``, ``second`` (K, 3): the viewing rays in each image, vectors along the robot's axes with depth 1 in the
+    camera. ``position`` (3,): position of the camera in the robot frame. ``motion`` (3,): the robot's pose at the
+    second image in the frame of its pose at the first image.
 
     An inverse depth is negative for a point behind the camera.
     """
@@ -114,8 +114,8 @@ def _inform(
     k: Lens, centres: Array, turns: Array, pixels: Array, sigmas: Array, point: Array, robust: float, squared: Array
 ) -> tuple[Array, Array, float]:
     """Return the Gauss-Newton system of a ``point`` (3,) in M images: its information matrix (3, 3), the negative
-    gradient (3, 1) of the loss, and the smallest depth. The images are those of :func:`triangulated`. Writes the
-    squared norms of the whitened residuals into ``squared`` (M,)."""
+    gradient (3, 1) of the loss, and the smallest depth. The remaining arguments are those of :func:`triangulated`.
+    Writes the squared norms of the whitened residuals into ``squared`` (M,)."""
     information, pull, depth, row, error = np.zeros((3, 3)), np.zeros((3, 1)), np.inf, np.empty(3), np.empty(2)
     for m in range(len(centres)):
         local = product((point - centres[m]).reshape(1, 3), turns[m])

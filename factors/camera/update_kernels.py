@@ -187,8 +187,8 @@ def marginal(residual: Array, jacobian: Array, robust: float, tempering: float) 
 
 @compiled(error_model="numpy")
 def leaning(image: PackedImage, pose: Array, covariance: Array) -> tuple[Array, Array]:
-    """Estimate the robot's roll and pitch from one image, by least squares. ``pose`` (3,), ``covariance`` (3, 3): the
-    prediction of the robot pose. Returns roll and pitch (2,) [rad] and their covariance (2, 2)."""
+    """Return the least-squares estimate (2,) [rad] of the robot's roll and pitch from one image, and its covariance (2,
+    2). ``pose`` (3,), ``covariance`` (3, 3): the prediction of the robot pose."""
     residual, jacobian = whitened(image, pose)
     prior = np.eye(POINT)
     put(inverse(covariance), prior)

@@ -84,7 +84,7 @@ class LoopFactor:
         return replace(self, robust=width * self.robust)
 
     def convex_width(self, values: Sequence[Array]) -> float:
-        """Return the smallest ``width`` >= 1 of :meth:`widened` that makes the loss convex at these two poses."""
+        """Return the smallest ``width`` >= 1 of :meth:`widened` that makes the loss convex at the poses ``values``."""
         error, _, _ = self.whitened(values)
         return max(1.0, math.sqrt(3.0) * float(np.linalg.norm(error)) / self.robust)
 

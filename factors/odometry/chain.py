@@ -53,15 +53,15 @@ TWIST_TIME = 0.1  # s; a velocity is the mean over this time
 class OdometryChain:
     """The integrated odometry of a run. Add odometry measurements (rows), then ask for states and motions at any time.
 
-    Rows may arrive late. The integrated states at the later rows are then computed again. After the last row, the robot
-    is assumed to continue with its velocity.
+    A row may be older than rows added before it. The integrated states at newer rows are then computed again. After the
+    newest row, the robot is assumed to continue with its velocity.
 
     ``model``: the odometry's constants and noise.
     ``use_gyro``: True if gyro rows replace the rotation of the wheels.
     ``horizon`` [s]: rows that are this much older than the newest row may be deleted. New rows before the oldest
     remaining row are rejected.
     ``estimated``: indices in :data:`~factors.odometry.model.PARAMETERS` of the P constants that the estimator
-    estimates. Methods with ``constants`` (P,), the corrections of these, correct motions accordingly.
+    estimates. Methods with an argument ``constants`` (P,) correct the motion by these corrections of the constants.
     """
 
     def __init__(
@@ -91,14 +91,14 @@ class OdometryChain:
 
     def add_velocity(self, t: float, v: float, w: float) -> bool:
         """Add an odometry measurement of forward speed [m/s] and turn rate [rad/s], valid from ``t`` until the next
-        measurement. Returns False if it is too old and is ignored."""
+        measurement. Returns False, and ignores it, if rows of this time were deleted."""
         return self._insert(t + self.model.delay, VELOCITY, v, w, 0.0, 0.0)
 
     def add_increment(self, t: float, dx: float, dy: float, dtheta: float, unknown: float = 0.0) -> bool:
         """Add the motion (dx, dy, dtheta) from the previous measurement until ``t``, in the robot frame at its start.
 
-        ``unknown`` [s]: the time of unknown motion since the previous measurement. A motion with the same ``t`` as an
-        existing one is composed with it. Returns False if it is too old and is ignored.
+        ``unknown`` [s]: the part of this time in which the motion is unknown. A motion with the same ``t`` as an
+        existing one is composed with it. Returns False, and ignores the motion, if rows of this time were deleted.
         """
         move, last = np.array((dx, dy, dtheta), dtype=float), self._count - 1
         while last >= 0 and self._rows[last, 0] == t and self._rows[last, 1] != INCREMENT:
@@ -113,7 +113,7 @@ class OdometryChain:
 
     def add_yaw_rate(self, t: float, w: float) -> bool:
         """Add a gyro measurement of the turn rate ``w`` [rad/s], valid from ``t`` until the next gyro measurement. It
-        replaces the rotation of the wheels. Returns False if it is too old and is ignored."""
+        replaces the rotation of the wheels. Returns False, and ignores it, if rows of this time were deleted."""
         return self._insert(t, GYRO, w, 0.0, 0.0, 0.0)
 
     def add_velocities(self, t: Array, v: Array, w: Array) -> int:
@@ -144,8 +144,8 @@ class OdometryChain:
         self._now_has(count, forgets=count < end)
 
     def state(self, t: float) -> ChainState:
-        """Return the integrated state at time ``t`` [s]. Before the first measurement the pose is constant and the
-        motion counts as unknown. Raises ValueError if the odometry of that time is deleted."""
+        """Return the integrated state at time ``t`` [s]. Before the first measurement the pose is constant, and all
+        time counts in the field ``unknown``. Raises ValueError if the odometry of that time is deleted."""
         if t < self.begin:
             raise ValueError(f"the odometry at {t:.3f} s was deleted, and is available only from {self.begin:.3f} s on")
         return ChainState(*state_at(self._knots, self._count, t, self._constants))
@@ -283,7 +283,7 @@ class OdometryChain:
 @compiled
 def state_at(knots: Array, count: int, t: float, constants: Array) -> State:
     """Return the integrated state at time ``t``, with the fields of :class:`~factors.motion.ChainState`. ``knots``: the
-    states at ``count`` odometry rows. ``constants``: the model as an array."""
+    states at ``count`` odometry rows. ``constants``: the constants of the odometry model as an array."""
     if count == 0:
         return t, 0.0, 0.0, 0.0, 0.0, 0.0, t, 0.0
     i = np.searchsorted(knots[:count, T], t, side="right") - 1
@@ -297,7 +297,7 @@ def state_at(knots: Array, count: int, t: float, constants: Array) -> State:
 
 @compiled
 def twist_at(knots: Array, count: int, constants: Array, t: float) -> tuple[float, float, float]:
-    """Return the mean velocity of :meth:`OdometryChain.twist`. The arguments are those of :func:`state_at`."""
+    """Return the robot's mean velocity (:meth:`OdometryChain.twist`). For the arguments see :func:`state_at`."""
     a, b = state_at(knots, count, t - TWIST_TIME, constants), state_at(knots, count, t, constants)
     moved = se2.between_scalars(a[1], a[2], a[3], b[1], b[2], b[3])
     x, y, turned = se2.log_scalars(moved[0], moved[1], moved[2])

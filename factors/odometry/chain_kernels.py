@@ -98,8 +98,8 @@ def insert(
 
     ``kind``: :data:`VELOCITY`, :data:`INCREMENT` or :data:`GYRO`. ``a``, ``b``, ``c``: its values, which are (v, w, 0),
     the logarithm of the motion, or (w, 0, 0). ``unknown`` [s]: the time of unknown motion in an increment. The
-    integrated states ``knots`` are updated with the model ``constants``. If the new row is the newest, rows older than
-    ``horizon`` [s] are deleted. Returns the new count.
+    integrated states ``knots`` are updated with the model ``constants``. If the new row is the newest, rows more than
+    ``horizon`` [s] older than it are deleted. Returns the new count.
     """
     i = count
     if count and t < knots[count - 1, T]:

@@ -181,9 +181,10 @@ def linearize(
 def linearize_changed(
     start: Array, end: Array, twist: Array, moving: float, constants: Array, indices: Integers, whitener: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Correct an increment for changed odometry constants, then linearise it between two poses ``start`` and ``end``.
-    ``twist``, ``moving``, ``constants``, ``indices``: as in :func:`~factors.odometry.kernels.changed`. ``whitener`` and
-    results: as in :func:`linearize`."""
+    """Linearise an increment between the poses ``start`` and ``end``, after a correction for changed odometry
+    constants.
+    ``twist`` (3,): the logarithm of the increment. ``moving`` [s]: its time in motion. ``constants``, ``indices`` (P,):
+    corrections of the constants, and their indices. ``whitener`` and results: as in :func:`linearize`."""
     delta, by_changes = changed(twist, moving, constants, indices)
     return linearize(start, end, delta, by_changes, whitener)
 
@@ -192,8 +193,8 @@ def linearize_changed(
 def linearize_as_reported(
     start: Array, end: Array, twist: Array, moving: float, constants: Array, indices: Integers, whitener: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Compute :func:`linearize_changed` with the translation of the residual divided by the estimated scale of
-    distances. The translation is then in the distance unit of the wheels, like the noise."""
+    """Return the results of :func:`linearize_changed` with the translation of the residual divided by the estimated
+    scale of distances. It is then in the distance unit of the wheels, like the noise. The arguments are the same."""
     unit = 1.0 + all_changes(constants, indices)[0]
     as_reported = whitener.copy()
     for i in range(3):
@@ -224,7 +225,7 @@ def linearize_all(
     by the first pose, the second pose and the parameters of the graph into ``jacobian`` (3 K, 6 + P).
 
     ``poses`` (N, 3), ``first`` (K,): increment k is between the poses ``first[k]`` and ``first[k] + 1``.
-    ``constants``, ``indices``: as in :func:`factors.odometry.kernels.changed`.
+    ``constants``, ``indices``: corrections of the estimated odometry constants, and their indices among all constants.
     ``column``: the first column of the constants in the Jacobian.
     """
     deltas, twists, moving, whiteners = steps
