@@ -44,9 +44,11 @@ PLOTS, PICTURE = "plots", "run.png"
 
 @dataclass(frozen=True)
 class ActiveJob:
-    """A planned simulation of active localization: the robot chooses its path with ``policy`` to localize itself.
+    """A planned simulation of active localization, in which a robot chooses its path to localize itself.
 
-    ``simulation``: the simulated world. ``settings``: settings of robot and policy. ``pictured``: whether to plot it.
+    ``simulation``: the simulated world. ``policy``: name of the method that chooses the path. ``estimator``: name of
+    the estimator of the pose. ``seed``: of all random numbers. ``settings``: settings of robot and policy.
+    ``pictured``: whether to plot the run.
     """
 
     simulation: SimulationSettings
@@ -68,7 +70,7 @@ class ActiveJob:
         return digest_of(given + [model.model_dump(mode="json") for model in (self.simulation, self.settings)])
 
     def make(self) -> Files:
-        """Execute the run. Return {file name: content}: the scores as JSON, and the plot as PNG if ``pictured`` is set.
+        """Execute the run, and return {file name: content}: scores as JSON, and a plot as PNG if ``pictured`` is true.
         If the run rejects its input, the only file describes the failure."""
         try:
             run = run_active(self.simulation, self.policy, self.estimator, self.seed, self.settings)

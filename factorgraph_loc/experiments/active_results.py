@@ -103,8 +103,8 @@ def summaries(rows: Sequence[Row]) -> list[dict[str, Any]]:
 def differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
     """Return comparisons of the first policy ``a`` with each other policy ``b``, for each world and estimator.
 
-    ``rows``: the runs. Only seeds of both policies are used; ``pairs`` is their number. Distance means the distance [m]
-    until the robot is localized. The other keys of a comparison are:
+    ``rows``: the runs. The first policy is that of the first row. Only seeds of both policies are used; ``pairs`` is
+    their number. Distance means the distance [m] until the robot is localized. The other keys of a comparison are:
 
     - ``difference``, ``low``, ``high`` [m]: median distance of a minus that of b, and its 95 % interval.
     - ``ratio``, ``ratio_low``, ``ratio_high``: median distance of a divided by that of b, and its 95 % interval.
@@ -195,8 +195,8 @@ def _median(rows: Sequence[Row], key: str) -> float:
 
 
 def comparison(rows: Sequence[Row]) -> Figure:
-    """Return a figure of the distances until localization, with a box for each policy. It also shows the fraction of
-    localized runs over distance. There is a row for each world and estimator."""
+    """Return a figure of the distances until localization (a box for each policy), and of the fraction of localized
+    runs. The fraction is over the driven distance. There is a row of plots for each world and estimator."""
     panels = cases(rows)
     seeds = len({row["seed"] for row in rows})
     figure, axes = grid(len(panels), 2, 4.2 * len(panels) + 1.0, f"metres driven until localized, {seeds} runs of each")
@@ -210,8 +210,8 @@ def comparison(rows: Sequence[Row]) -> Figure:
 
 
 def run_picture(run: ActiveRun) -> Figure:
-    """Return a figure of some decisions of a run: the estimated distribution of the pose (belief), the candidate paths
-    and the chosen path. It also shows the standard deviation of the belief over distance."""
+    """Return a figure of some decisions of a run, and of the standard deviation of the belief over distance. A decision
+    is drawn as the estimated distribution of the pose (belief), the candidate paths and the chosen path."""
     chosen = np.unique(np.linspace(0, len(run.steps) - 1, SHOWN).round().astype(int)) if run.steps else ()
     rows = max(math.ceil(len(chosen) / COLUMNS), 1)
     width, depth = np.ptp(_outline(run).reshape(-1, 2), axis=0)
@@ -282,7 +282,7 @@ def _farthest(rows: Sequence[Row], case: tuple[str, str]) -> float:
 
 
 def _step(axis: Axes, run: ActiveRun, index: int) -> None:
-    """Plot one decision of a run. ``index``: number of the decision."""
+    """Plot one decision of a run. ``index``: index of the decision in ``run.steps``."""
     step = run.steps[index]
     for i, (x1, y1, x2, y2) in enumerate(run.world.walls):
         axis.plot((x1, x2), (y1, y2), color="0.35", linewidth=1.0, label=None if i else "walls", zorder=1)

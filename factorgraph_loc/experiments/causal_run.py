@@ -41,8 +41,9 @@ GARBAGE_THRESHOLDS = 20_000, 20, 20  # see the documentation of ``gc.set_thresho
 class CausalEstimates:
     """The estimates of a run, recorded online at regular times (ticks). Each field is a list with one entry per tick.
 
-    ``t``: times [s]. ``poses``, ``covariances``: (3,) and (3, 3), of (x, y, heading) [m, rad]. ``status``: whether the
-    pose is known, ambiguous or unknown. ``doubts_model``: whether measurements contradict the model of their sensor.
+    ``t``: times [s]. ``poses``: arrays (3,) of x, y [m] and heading [rad]. ``covariances``: arrays (3, 3). ``status``:
+    whether the pose is known, ambiguous or unknown. ``doubts_model``: True if measurements contradict the model of
+    their sensor.
     """
 
     t: list[float] = field(default_factory=list)
@@ -118,7 +119,8 @@ class CausalRun:
     def timings(self, final_seconds: float, prepared: PreparedLog) -> Timings:
         """Return the computing times of a run. Call this after :meth:`run`.
 
-        ``final_seconds`` [s]: time for the final trajectory. ``prepared``: has the time for the detection of features.
+        ``final_seconds`` [s]: time for the final trajectory. ``prepared``: the log that was processed. It has the
+        number of images, and the time for the detection of features in them.
         """
         return Timings(
             update_t=np.array(self._update_t),
@@ -132,8 +134,8 @@ class CausalRun:
         )
 
     def _measurements(self) -> Iterator[Measurement]:
-        """Return the measurements until ``end``, in order of time. If the estimator has the attribute ``takes_rows``,
-        successive measurements of odometry are joined in one ``Rows`` object."""
+        """Return the measurements until ``end`` [s], in order of time. If the estimator has the attribute
+        ``takes_rows``, successive measurements of odometry are arrays in one ``Rows`` object."""
         joined = getattr(self.estimator, "takes_rows", False)
         steps = self.log.steps(self.sensors) if joined else self.log.measurements(self.sensors)
         return takewhile(lambda m: m.t <= self.end, steps)
@@ -146,8 +148,9 @@ class CausalRun:
         self._pass(self.ticks.advance(t))
 
     def _move(self, m: Measurement) -> None:
-        """Process one measurement of odometry, or several (``Rows``). Estimates at ticks between joined measurements
-        are recorded after them, because the state at a tick depends only on earlier measurements."""
+        """Process ``m``, one measurement of odometry or several in a ``Rows`` object. The estimates at ticks between
+        the measurements of ``Rows`` are recorded after all of them. This does not change them, because the state at a
+        tick depends only on earlier measurements."""
         if not isinstance(m, Rows):
             self._reach(m.t)
             self.guard.process(self.estimator, m)

@@ -39,7 +39,8 @@ _ONE = Lock()  # a worker process executes one run at a time, so that computing 
 
 @dataclass(frozen=True)
 class _Made:
-    """The files of a run by name. ``late``: address of the worker if it still runs after the time limit, or None."""
+    """The result of a run. ``files``: {file name: content}. ``late``: address of a worker that still computes the run
+    after the time limit, otherwise None."""
 
     files: Files
     late: str | None = None
@@ -48,9 +49,9 @@ class _Made:
 class Cluster(Executor):
     """Executes runs on a ``dask.distributed`` cluster. ``scheduler``: address of its scheduler.
 
-    This class limits the time of a run, and the cluster limits the memory. ``with`` raises InputError if the package
-    ``distributed`` is not installed, or if the scheduler does not answer or has no workers. InputError is also raised
-    for a worker with other code or libraries, and RunFailedError if the connection is lost.
+    This class limits the time of a run, and the cluster limits the memory. Entering the context (``with``) raises
+    InputError if the package ``distributed`` is not installed, or if the scheduler does not answer or has no workers.
+    InputError is also raised for a worker with other code or libraries, and RunFailedError if the connection is lost.
     """
 
     def __init__(self, scheduler: str, limits: Limits) -> None:

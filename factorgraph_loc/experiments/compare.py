@@ -38,7 +38,8 @@ FINISHED = (*WRITTEN, *FILES)  # names of files of results, which are replaced o
 
 @dataclass(frozen=True, repr=False)
 class Comparison(Done):
-    """The results of a comparison of estimators. ``repr`` gives its table. ``out``: the folder of the results."""
+    """The results of a comparison of estimators. ``out``: the folder of the results. ``repr`` returns the table as
+    text."""
 
     out: Path
 
@@ -47,8 +48,8 @@ class Comparison(Done):
 
 
 def summary_text(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Return the table of a comparison as text, with sentences about missing scores, the best estimator and failed
-    runs. ``rows``: the runs."""
+    """Return the table of a comparison as text, followed by sentences. The sentences are about missing scores, the best
+    estimator and failed runs. ``rows``: the runs as dictionaries."""
     best = verdict(rows) if len({row["estimator"] for row in rows}) > 1 else []
     failures = [f"failed: {row['log']}, {row['estimator']}: {row['reason']}" for row in rows if row["status"] != "ok"]
     return "\n".join((markdown(*comparison_cells(rows)), *unscored(rows), *best, *failures))
@@ -77,10 +78,11 @@ def compare(
 
     ``out``: folder for the results, None for a new folder in ``out/``. ``overwrite``: whether existing results in
     ``out`` may be replaced. ``settings``: {estimator: {key: value}}. ``rig``, ``world``: sensors and map to use instead
-    of those of the logs. ``sensors``, ``prior``, ``max_gap``, ``tick_gap``, ``align``: see
-    :class:`~factorgraph_loc.experiments.experiment_file.Experiment`. ``rpe``: whether to report relative pose errors.
-    ``jobs``: number of processes, None for one per core. ``progress``: called with the numbers of finished and all
-    runs.
+    of those of the logs. ``sensors``: names of the sensors to use, None for all of the rig. ``prior``: the start pose,
+    such as "log", "reference" or "unknown". ``max_gap`` [s]: scores exclude longer gaps between estimates. ``tick_gap``
+    [s]: there are no estimates in longer gaps between measurements. ``align``: for additional scores after this
+    alignment, such as "se2". ``rpe``: whether to report relative pose errors. ``jobs``: number of processes, None for
+    one per core. ``progress``: called with the numbers of finished and all runs.
 
     A failed run does not stop the others, and the table states the reason. Runs with stored results are not repeated.
     The files in ``out`` are:

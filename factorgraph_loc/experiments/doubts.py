@@ -17,9 +17,10 @@ LEAST_SHARE = 0.9  # minimum fraction of the estimates' time span that the refer
 
 
 def partly_scored(log: Log, final: Trajectory, max_gap: float) -> tuple[Notice, ...]:
-    """Return a warning if the reference has too few poses for scores, or covers only part of the time of the estimates.
+    """Return a tuple with a warning if scores are impossible or cover only part of the run, else an empty tuple.
 
-    ``final``: the final trajectory. ``max_gap`` [s]: maximum gap across which estimates are interpolated for scores.
+    Scores are impossible if the reference has too few poses. ``final``: the final trajectory. ``max_gap`` [s]: maximum
+    gap across which estimates are interpolated for scores.
     """
     reference = log.reference
     if reference is None or not len(reference) or not len(final):
@@ -37,8 +38,9 @@ def partly_scored(log: Log, final: Trajectory, max_gap: float) -> tuple[Notice, 
 
 
 def map_error_warning(log: Log, frame: MapFrame, final: Trajectory) -> tuple[Notice, ...]:
-    """Return a warning about the error of a map that was made without a reference. It states the median and the maximum
-    of the error along the trajectory ``final``. ``frame``: has the covariance of this error at each pose."""
+    """Return a tuple with a warning about the error of a map that was made without a reference. Empty for other maps.
+    The warning states the median and the maximum of the error along the trajectory ``final``. ``frame``: has the
+    covariance of this error at each pose."""
     if frame.error is None or not len(final):
         return ()
     worst = np.linalg.eigvalsh(frame.error(final.poses)[:, :2, :2])[:, -1]
@@ -51,10 +53,8 @@ def map_error_warning(log: Log, frame: MapFrame, final: Trajectory) -> tuple[Not
 
 
 def with_pauses(log: Log, skipped: Sequence[tuple[float, float]], tick_gap: float) -> tuple[Notice, ...]:
-    """Return a warning about gaps between measurements. There are no estimates in these gaps.
-
-    ``skipped``: begin and end [s] of each gap. ``tick_gap`` [s]: the minimum length of such a gap.
-    """
+    """Return a tuple with a warning about gaps between measurements, in which there are no estimates. Empty without
+    gaps. ``skipped``: begin and end [s] of each gap. ``tick_gap`` [s]: the minimum length of such a gap."""
     if not skipped:
         return ()
     begin, end = max(skipped, key=lambda gap: gap[1] - gap[0])

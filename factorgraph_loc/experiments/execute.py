@@ -61,18 +61,20 @@ class Planned(Protocol):
 
 
 class Take(Protocol):
-    """A function that claims and returns the next run, or None if there is none now."""
+    """A function that reserves and returns the next run to compute, or None if there is none now."""
 
     def __call__(self, loaded: Hashable = None, avoided: Sequence[Hashable] = ()) -> Planned | None:
-        """Return the next run, if possible with the source ``loaded``, which the worker has in memory. Otherwise, if
-        possible, its source is none of ``avoided``, which other workers use."""
+        """Return the next run, or None if there is none now. Runs of the source ``loaded`` are preferred. ``loaded``:
+        the source that the worker has in memory. ``avoided``: sources that other workers have in memory. Their runs are
+        returned only if there are no others."""
 
 
 class Executor(AbstractContextManager[Any], Protocol):
     """Computes runs by :func:`compute` in other processes. As a context manager, it stops all computations on exit."""
 
     def submit(self, take: Take, left: int) -> None:
-        """Start as many runs as possible. ``take``: returns the next run. ``left``: number of runs without a result."""
+        """Start as many runs as possible. ``take``: a function that returns the next run. ``left``: number of all
+        unfinished runs."""
 
     def finished(self) -> Iterable[tuple[str, Files]]:
         """Return (key, files) of each run that has ended since the last call. Waits at most about half a second."""
@@ -91,7 +93,8 @@ class _Queue:
         return sum(map(len, self._runs.values())) + len(self.later)
 
     def next(self, loaded: Hashable, avoided: Sequence[Hashable]) -> Planned | None:
-        """Remove and return the next run; see :class:`Take`. Return None if there is none now."""
+        """Remove and return the next run, or return None if there is none now. ``loaded``: a preferred source of the
+        run. ``avoided``: sources of runs that are returned only if there are no others."""
         while self.later and self.later[0][0] <= time.monotonic():
             self._add(self.later.pop(0)[1])
         if not self._runs:
@@ -111,11 +114,12 @@ class _Queue:
 def execute(
     runs: Sequence[Planned], folder: Path, executor: Executor, *, again: bool = False
 ) -> Iterator[tuple[str, State]]:
-    """Compute ``runs`` and store their results or failures below ``folder``. Yield the key and the state of each run.
+    """Compute ``runs`` and store their results or failures below ``folder``. Yield (key, state) of each run when it
+    ends.
 
-    Runs with stored results are not repeated. ``again``: repeat stored failures. If another process computes a run,
-    this waits for its result. When the generator is closed, the executor stops immediately, and unfinished runs are not
-    stored. Raises StoreError if the store cannot be written.
+    ``executor``: computes the runs in other processes. Runs with stored results are not repeated. ``again``: repeat
+    stored failures. If another process computes a run, this waits for its result. When the generator is closed, the
+    executor stops immediately, and unfinished runs are not stored. Raises StoreError if the store cannot be written.
     """
     store, queue = Store(folder), _Queue(runs)
     claims: dict[str, ExitStack] = {}

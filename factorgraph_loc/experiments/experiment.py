@@ -104,10 +104,11 @@ def experiment(
 ) -> Done:
     """Execute the runs of an experiment file that have no stored results yet, and return the results of all runs.
 
-    ``changes``, ``out``, ``data_root``: see :func:`prepare`. ``jobs``: number of processes, None for one per core.
-    ``scheduler``: address of the scheduler of a ``dask.distributed`` cluster, which then executes the runs.
-    ``retry_failed``: whether to repeat failed runs. Damaged runs are always repeated. ``progress``: called with the
-    numbers of finished, all and failed runs.
+    ``changes``: {dotted key: value} that replace values of the file. ``out``: folder of the results, None for the
+    folder that the file names. ``data_root``: folder of the datasets, None for the environment variable FGLOC_DATA.
+    ``jobs``: number of processes, None for one per core. ``scheduler``: address of the scheduler of a
+    ``dask.distributed`` cluster, which then executes the runs. ``retry_failed``: whether to repeat failed runs. Damaged
+    runs are always repeated. ``progress``: called with the numbers of finished, all and failed runs.
 
     A failed run raises no exception. It has a row in the table of results and an entry in ``failures``.
     """
@@ -122,7 +123,9 @@ def status(
     out: str | Path | None = None,
     data_root: str | Path | None = None,
 ) -> ExperimentStatus:
-    """Return how many runs of an experiment file are ok, failed, missing or damaged. Arguments: see :func:`prepare`."""
+    """Return how many runs of an experiment file are ok, failed, missing or damaged. ``changes``: {dotted key: value}
+    that replace values of the file. ``out``: folder of the results, None for the folder that the file names.
+    ``data_root``: folder of the datasets, None for the environment variable FGLOC_DATA."""
     _, planned = prepare(file, changes, out=out, data_root=data_root)
     counts = {run.label: dict.fromkeys(STATES, 0) for run in planned.runs}
     for run in planned.runs:
@@ -144,9 +147,9 @@ def prepare(
 ) -> tuple[Experiment, Prepared[PlannedRun]]:
     """Return the content of an experiment file, and its planned runs with the states of their stored results.
 
-    ``changes``: values that replace values of the file, see
-    :func:`~factorgraph_loc.experiments.experiment_file.read_experiment`. ``data_root``: the data folder, None for the
-    environment variable FGLOC_DATA. ``out``: folder of the results, None for the folder that the file names.
+    ``changes``: {dotted key: value} that replace values of the file, such as ``{"smoother.lag": 10}``. ``data_root``:
+    folder of the datasets, None for the environment variable FGLOC_DATA. ``out``: folder of the results, None for the
+    folder that the file names.
 
     Raises InputError for errors in the file and for too many runs, and StoreError if ``out`` cannot be written.
     """
@@ -171,8 +174,10 @@ def run_experiment(
 ) -> Done:
     """Execute the runs without stored results, write the table of all results, and return the results.
 
-    ``again``: whether to repeat failed runs. For ``jobs``, ``scheduler`` and ``progress`` see :func:`experiment`. The
-    table is written also after an error or an interrupt. Raises StoreError if the store cannot be written.
+    ``jobs``: number of processes, None for one per core. ``scheduler``: address of the scheduler of a
+    ``dask.distributed`` cluster, which then executes the runs. ``again``: whether to repeat failed runs. ``progress``:
+    called with the numbers of finished, all and failed runs. The table is written also after an error or an interrupt.
+    Raises StoreError if the store cannot be written.
     """
     from factorgraph_loc.experiments.result_table import collect, write_index  # noqa: PLC0415
 
@@ -209,10 +214,10 @@ def run_experiment(
 
 
 def estimate_seconds(runs: Sequence[PlannedRun], folder: Path) -> float:
-    """Return an estimate of the total computing time [s] of runs, from the durations of their logs.
+    """Return an estimate of the total computing time [s] of ``runs``, from the durations of their logs.
 
-    ``folder``: folder of the stored results. Stored runs with the same label show how fast an estimator is. Without
-    stored runs of a label, :data:`PACE` is assumed.
+    ``folder``: folder of stored results. The computing time per second of log is that of stored runs with the same
+    label. Without such runs it is :data:`PACE`.
     """
     from factorgraph_loc.experiments.result_table import load_results  # noqa: PLC0415
 

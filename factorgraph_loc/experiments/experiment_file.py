@@ -160,8 +160,9 @@ class Sweep(FileModel):
     def points(self, *words: str) -> list[dict[str, Scalar]]:
         """Return the combinations of values of swept settings, without duplicates. Each is {dotted name: value}.
 
-        ``words``: only settings with names that start with one of these words are combined. Without ``words`` all
-        settings are combined. Without settings, the result is [{}]. At most :data:`MOST_RUNS` + 1 are returned.
+        ``words``: the first parts of the dotted names that are combined, such as "simulation". Without ``words`` all
+        settings are combined. Without settings, the result is [{}]. At most :data:`MOST_RUNS` + 1 combinations are
+        returned.
         """
         columns = {key: values for key, values in self.over.items() if not words or key.partition(".")[0] in words}
         combined: Iterable[tuple[Scalar, ...]] = itertools.product(*map(dict.fromkeys, columns.values()))
@@ -264,8 +265,9 @@ def write_new(file: Path, *, overwrite: bool = False) -> None:
 def read_experiment(path: Path, changes: Mapping[str, Any] | None = None) -> Experiment:
     """Return the experiment in a TOML file.
 
-    ``changes``: {dotted key: value} to replace values of the file. The key ``LABEL.KEY`` is a setting of an estimator,
-    and ``simulation.KEY`` a setting of all simulated logs. Raises InputError with file and key if a value is invalid.
+    ``changes``: {dotted key: value} that replace values of the file. The key ``LABEL.KEY`` is a setting of an
+    estimator, and ``simulation.KEY`` a setting of all simulated logs. Raises InputError with file and key if a value is
+    invalid.
     """
     content = read_toml(path)
     for key, value in (changes or {}).items():

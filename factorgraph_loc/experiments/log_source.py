@@ -68,7 +68,8 @@ class LogSource(ABC):
 
     @abstractmethod
     def files(self) -> dict[str, Path]:
-        """Return {name: path} of the files of the log. The names do not depend on the location of the files."""
+        """Return {name: path} of the files of the log. A name does not depend on the folder of the datasets or of the
+        log."""
 
     @abstractmethod
     def identity(self) -> dict[str, Any]:
@@ -83,10 +84,10 @@ class LogSource(ABC):
 class RecordedSource(LogSource):
     """A recorded log.
 
-    ``log``: a name or path for :func:`~factorgraph_loc.io.readers.load`. ``number``: index of the log if there are
-    several. ``reader``: name of the reader, None to find it by the file. ``options``: options of the reader as JSON.
-    ``rig``, ``world``: files to use instead of those of the log. ``data_root``: the data folder, None for the
-    environment variable FGLOC_DATA.
+    ``log``: a path, or a name that ``fgloc datasets`` lists. ``number``: index of the log if there are several.
+    ``reader``: name of the reader, None to find it by the file. ``options``: options of the reader as JSON. ``rig``,
+    ``world``: files to use instead of those of the log. ``data_root``: folder of the datasets, None for the environment
+    variable FGLOC_DATA.
     """
 
     log: str

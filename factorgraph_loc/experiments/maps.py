@@ -67,13 +67,13 @@ class MapOptions:
     """How a map is made.
 
     ``of``: landmarks, tags or points. None: points if the log has images, landmarks if it has measurements of
-    landmarks, else tags. ``estimator``, ``settings``: the estimator of landmarks, and its settings. ``points``:
-    settings of a map of points, fields of :class:`~factorgraph_loc.mapping.point_mapping.PointSettings`. ``extend``:
-    whether to keep the log's map and to add missing objects. ``poses``: source of the robot poses for a map of tags:
-    "reference", or "odometry" to estimate the poses together with the tags. None: "reference" if the log has one, else
-    "odometry". ``height`` [m]: height of new tags or landmarks, None for the height of the antennas or of the radio.
-    ``drop_dead``: make no new map, but remove dead tags from the log's map. A dead tag is never read, although the
-    smoother expects reads. ``prior``: prior of the start, see
+    landmarks, else tags. ``estimator``, ``settings``: the estimator of landmarks, and its settings {key: value}.
+    ``points``: settings of a map of points, {field of :class:`~factorgraph_loc.mapping.point_mapping.PointSettings`:
+    value}. ``extend``: whether to keep the log's map and to add missing objects. ``poses``: source of the robot poses
+    for a map of tags: "reference", or "odometry" to estimate the poses together with the tags. None: "reference" if the
+    log has one, else "odometry". ``height`` [m]: height of new tags or landmarks, None for the height of the antennas
+    or of the radio. ``drop_dead``: make no new map, but remove dead tags from the log's map. A dead tag is never read,
+    although the smoother expects reads. ``prior``: the start pose, such as "log" or "unknown", see
     :func:`~factorgraph_loc.experiments.preparation.resolve_prior`.
     """
 
@@ -111,7 +111,9 @@ class MadeMap:
     draw: Callable[[], Figure]
 
     def write(self, out: Path, *, overwrite: bool = False) -> None:
-        """Write the map to ``out``, and its plot next to it. Raises InputError as :func:`plot_path`, or on failure."""
+        """Write the map to the file ``out``, and its plot next to it. ``overwrite``: whether existing files may be
+        replaced. Raises InputError if they may not, a file cannot be written, or ``out`` has another suffix than
+        :data:`SUFFIX`."""
         picture = plot_path(out, overwrite=overwrite)
         with writing(out), replacing(picture) as temporary:  # so that either both files are written, or none
             temporary.write_bytes(png_bytes(self.draw()))
@@ -129,8 +131,8 @@ def plot_path(out: Path, *, overwrite: bool) -> Path:
 def make_map(log: Log, options: MapOptions | None = None, progress: Progress = lambda _share: None) -> MadeMap:
     """Return a map made from a log. If the log has a map already, it is compared with the new map, or extended.
 
-    ``progress``: called with the completed fraction. Raises InputError if options contradict each other or do not fit
-    the log, and RunFailedError if nothing could be located.
+    ``options``: how to make the map, None for the defaults. ``progress``: called with the completed fraction. Raises
+    InputError if options contradict each other or do not fit the log, and RunFailedError if nothing could be located.
     """
     options = options or MapOptions()
     if options.drop_dead:

@@ -92,8 +92,9 @@ def write_run(
 def save_run(
     result: RunResult, log: Log, out: Path, *, align: Alignment = "none", overwrite: bool = False
 ) -> dict[str, Any]:
-    """Write the files of a run as :func:`write_run`, and return the scores. If that fails, write them to a new
-    temporary folder instead, and raise an InputError that names this folder."""
+    """Write the files of a run into the folder ``out``, and return the scores by key, as :func:`write_run`. If writing
+    fails, write them to a new temporary folder, and raise an InputError that names it. ``align``: alignment for
+    additional scores. ``overwrite``: whether existing results may be replaced."""
     try:
         return write_run(result, log, out, align=align, overwrite=overwrite)
     except InputError as error:
@@ -244,7 +245,8 @@ def _rows(
 
 
 def _slowest_update(result: RunResult) -> Array:
-    """Return for each tick the time [ms] of the slowest update since the previous tick, NaN if there was none."""
+    """Return for each tick (time of an estimate) the time [ms] of the slowest update since the previous tick, NaN
+    without one."""
     slowest = np.full(len(result.t), np.nan)
     tick = np.searchsorted(result.t, result.timings.update_t)
     inside = tick < len(result.t)  # updates after the last tick are omitted

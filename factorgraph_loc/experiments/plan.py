@@ -35,7 +35,8 @@ class PlannedRun(RunConfig):
     """A planned run of an estimator on a log, which can be sent to other processes.
 
     ``source``: how to load the log. ``log_digest``: hash of its content. ``log``: its name. ``duration`` [s]: of the
-    log. ``label``: of the estimator. ``sweep``: {dotted name: value} of swept settings. ``key``: key of the results.
+    log. ``label``: name of the estimator in the results. ``sweep``: {dotted name: value} of swept settings. ``key``:
+    key of the results in the store.
     """
 
     source: LogSource
@@ -100,8 +101,8 @@ def plan(
     """Return all planned runs of an experiment.
 
     ``folder``: paths in the experiment are relative to it. ``cache``: folder for a cache of hashes of files and of
-    properties of logs and estimators. ``data_root``: the data folder, None for the environment variable FGLOC_DATA.
-    ``given``: sources of logs to use instead of the logs of the experiment.
+    properties of logs and estimators. ``data_root``: folder of the datasets, None for the environment variable
+    FGLOC_DATA. ``given``: sources of logs to use instead of the logs of the experiment.
 
     Swept settings of one estimator do not multiply the runs of other estimators. Deterministic estimators run only with
     the first seed.

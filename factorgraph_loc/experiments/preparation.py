@@ -60,10 +60,8 @@ def at_origin(log: Log) -> PosePrior:
 
 
 def first_odometry(log: Log) -> float:
-    """Return the time [s] of the first odometry, or of the first measurement if there is no odometry.
-
-    The offset of the sensor's clock is applied.
-    """
+    """Return the time [s] of the first odometry, or of the first measurement if there is no odometry. The time offset
+    of the sensor in the rig is added."""
     starts = [
         float(t.min()) + log.rig.time_offset(name) for name in moving(log.streams) if len(t := log.streams[name].t)
     ]
@@ -131,7 +129,8 @@ def used_sensors(log: Log, asked: tuple[str, ...] | None) -> tuple[str, ...]:
 
 
 def unused(log: Log, sensors: tuple[str, ...]) -> tuple[Notice, ...]:
-    """Return warnings about sensors of the rig that cannot be used. Also warn if the used ``sensors`` lack odometry."""
+    """Return warnings about sensors of the rig that cannot be used, and a warning if ``sensors`` have no odometry.
+    ``sensors``: names of the used sensors."""
     available = (*log.streams, *_filled_columns(log))
     sentence = "{log}: the rig lists the sensor {sensor}, the log has none"
     doubts = [notice("no_stream", sentence, log.name, s) for s in log.rig.sensors if s not in available]
@@ -148,9 +147,10 @@ def unused(log: Log, sensors: tuple[str, ...]) -> tuple[Notice, ...]:
 
 
 def use_of(log: Log, sensors: Sequence[str], estimator: str, settings: FileModel, given: Collection[str] = ()) -> Use:
-    """Return the log, sensors, estimator and settings of a run as one object, for :func:`checked_use`.
+    """Return the log, sensors, estimator and settings of a run as one object, which :func:`checked_use` needs.
 
-    ``given``: names of the settings that the user has set.
+    ``sensors``: names of the used sensors. ``estimator``: its name. ``given``: names of the settings that the user has
+    set.
     """
     kind = registry.estimator_type(estimator)
     modalities = getattr(kind, "modalities", frozenset[str]())
@@ -158,11 +158,8 @@ def use_of(log: Log, sensors: Sequence[str], estimator: str, settings: FileModel
 
 
 def checked_use(use: Use) -> Use:
-    """Return the description of a run, with settings and warnings that the sensor packages have changed. Each sensor
-    package has a function ``check``, which compares the settings with the log.
-
-    Raises InputError if a setting does not fit the log.
-    """
+    """Return ``use``, the description of a run, after the checks of all sensor packages. A check compares the settings
+    with the log. It may change the settings and add warnings. Raises InputError if a setting does not fit the log."""
     for _, check in functions("check"):
         use = check(use)
     return use

@@ -40,7 +40,9 @@ def report(
 ) -> Report:
     """Write the results of an experiment as an HTML page into its folder. Damaged results are listed, but not used.
 
-    For the arguments see :func:`~factorgraph_loc.experiments.experiment.prepare`.
+    ``file``: the experiment file. ``changes``: {dotted key: value} that replace values of the file. ``out``: folder of
+    the results, None for the folder that the file names. ``data_root``: folder of the datasets, None for the
+    environment variable FGLOC_DATA.
     """
     return report_experiment(*prepare(file, changes, out=out, data_root=data_root))
 

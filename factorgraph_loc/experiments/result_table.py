@@ -18,7 +18,8 @@ TEXTS = {"label", "log", "estimator", "sensors", "prior", "status", "kind", "rea
 
 
 def collect(runs: Iterable[Planned], store: Store) -> pl.DataFrame:
-    """Return a table of stored runs, see :func:`load_results`. Raises DamagedError if a result is damaged."""
+    """Return a table with a row for each of ``runs``, see :func:`load_results`. ``store``: the store with their
+    results. Raises DamagedError if a result is missing or damaged."""
     rows = [run.columns | store.row(run.key) for run in runs]
     keys = dict.fromkeys(key for row in rows for key in row) or dict.fromkeys(sorted(TEXTS))
     table = pl.DataFrame(rows, schema=list(keys), infer_schema_length=None)

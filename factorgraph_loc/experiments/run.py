@@ -53,8 +53,9 @@ def run(
 ) -> RunResult:
     """Run an estimator on a log, and return the estimated trajectories with diagnostics and warnings.
 
-    ``progress``: called with the completed fraction. If features are extracted from images, this is the first half.
-    ``watch``: called with the time [s] and the estimator after each tick, for instance to inspect its belief.
+    ``config``: estimator, settings and sensors. ``progress``: called with the completed fraction. If features are
+    extracted from images, this is the first half. ``watch``: called with the time [s] and the estimator after each
+    tick, for instance to inspect its belief.
 
     Causal estimates are recorded at ticks. Ticks are at 10 Hz from the time of the prior on, except inside gaps between
     measurements longer than ``config.tick_gap``. The estimator processes all measurements that arrive up to a tick

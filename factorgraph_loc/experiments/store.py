@@ -207,7 +207,8 @@ class Store:
 
     @contextmanager
     def claim(self, key: str) -> Iterator[bool]:
-        """Lock a run against other processes in this block. Yields True, or False if another process has locked it."""
+        """Lock the run ``key`` in this ``with`` block. Yields False if another process has already locked it, else
+        True."""
         path = self.folder / "claims" / key
         with self._writing():
             handle = os.open(path, os.O_RDWR | os.O_CREAT, 0o666)
