@@ -38,7 +38,7 @@ FEW = 40  # at most this many images are rendered by one process, because starti
 
 @dataclass(frozen=True, eq=False)
 class Film:
-    """The N images of a simulated drive. ``film[i]`` renders image i, (H, W, 3) BGR, independently of other images.
+    """The N images of a simulated drive. ``film[i]`` renders the image with index i, (H, W, 3) BGR.
 
     ``times`` (N,) [s]: the times of the middle of the exposures. ``stamps`` (N,) [s]: the same times by the camera's
     clock. ``truth``: the true trajectory of the robot. ``renderer``: renders the images, and computes the 3-D point of
@@ -85,10 +85,11 @@ class Film:
 
 
 def film(settings: SimulationSettings, seed: int) -> Film:
-    """Return the images of a simulated drive. :func:`~factorgraph_loc.simulation.simulate` returns the log of the same
-    drive for the same settings and seed.
+    """Return the images of a simulated drive, which are rendered when they are requested.
 
-    Raises InputError if the rig has no camera, or if the camera is higher than the furniture.
+    The function :func:`~factorgraph_loc.simulation.simulate` returns the log of the same drive for the same
+    ``settings`` and ``seed``. Raises InputError if the rig has no camera, or if the camera is higher than the
+    furniture.
     """
     camera = settings.rig.find(CameraSettings)
     if camera is None:

@@ -45,7 +45,7 @@ def clouds(rng: np.random.Generator, height: int, width: int, cell: float) -> ND
 
 
 def shaded(canvas: Canvas, factor: NDArray[np.float32]) -> Canvas:
-    """Return a picture with each pixel multiplied by its ``factor`` (H, W)."""
+    """Return a picture with each pixel multiplied by a ``factor`` of its own. ``factor`` (height, width)."""
     out = np.empty_like(canvas)
     for i in range(0, len(canvas), 256):  # in strips, to limit the memory
         out[i : i + 256] = np.clip(canvas[i : i + 256] * factor[i : i + 256, :, None], 0.0, 255.0)
@@ -62,8 +62,8 @@ def paste(canvas: Canvas, picture: Canvas, x: int, y: int) -> None:
 
 
 def write(canvas: Canvas, rng: np.random.Generator, box: tuple[int, int, int, int], size: int, colour: Colour) -> None:
-    """Draw lines of random letters in ``box`` (x1, y1, x2, y2) of a picture. A letter has 5 x 3 dots of ``size``
-    texels."""
+    """Draw lines of random letters into ``box`` (x1, y1, x2, y2) [texels] of a picture, in one ``colour`` (BGR). A
+    letter has 5 x 3 dots of ``size`` texels. A texel is a pixel of a texture."""
     x1, y1, x2, y2 = box
     letters, lines = (x2 - x1) // (4 * size), (y2 - y1) // (8 * size)
     for line in range(lines):

@@ -108,9 +108,9 @@ def surroundings(faces: Array, bottoms: Array, tops: Array, origin: Array, size:
 def cast(table: Array, starts: Ints, items: Ints, place: Place, dx: float, dy: float, dz: float) -> tuple[int, float]:
     """Return the index of the face that the ray along (dx, dy, dz) hits first, and the distance of the hit point.
 
-    The index is a row of the table, or :data:`GROUND`, :data:`CEILING` or :data:`NOTHING`. The unit of the distance is
-    the length of (dx, dy, dz). ``table``, ``starts``, ``items``: of :class:`Surroundings`. ``place``: the camera and
-    the building.
+    The index is a row of ``table``, or :data:`GROUND`, :data:`CEILING` or :data:`NOTHING`. The unit of the distance is
+    the length of (dx, dy, dz). ``table``: the faces. ``starts``, ``items``: the index of faces by direction, fields of
+    :class:`Surroundings`. ``place``: the camera position and the size of the building.
     """
     best, row = np.inf, NOTHING
     x0, y0, z0, top, per_width, per_depth = place
@@ -168,12 +168,13 @@ def expose(
     rows: NDArray[np.int16],
     out: NDArray[np.float32],
 ) -> None:
-    """Render an image of the building into ``out``. At edges of faces, a pixel is the mean of four rays.
+    """Render an image of the building, and add it to ``out`` (H, W, 3). At edges of faces, a pixel is the mean of four
+    rays.
 
-    ``texels`` (T, 3), ``layout``: the textures, see :class:`~factorgraph_loc.simulation.renderer.TexturedScene`.
-    ``directions`` (H, W, 2): x and y of each pixel's ray at depth 1 in the camera frame. ``rotation`` (3, 3): from
-    camera to world. ``pixel_at_one``: the size of a pixel at a depth of 1 m, in texels. ``rows`` (H, W): work array.
-    ``out`` (H, W, 3): the colours are added here.
+    ``around``: the faces that are visible from the camera. ``texels`` (T, 3), ``layout``: the textures, fields of
+    :class:`~factorgraph_loc.simulation.renderer.TexturedScene`. ``directions`` (H, W, 2): x and y of each pixel's ray
+    at depth 1 in the camera frame. ``rotation`` (3, 3): from camera to world. ``pixel_at_one``: the size of a pixel at
+    a depth of 1 m, in texels. ``rows`` (H, W): work array.
     """
     height, width = directions.shape[:2]
     table, starts, items = around.table, around.starts, around.items

@@ -64,8 +64,8 @@ class TexturedScene:
 
 
 def make_scene(plan: Plan, tags: Sequence[Tag], rng: np.random.Generator) -> TexturedScene:
-    """Return the building of a plan with random textures and random heights of furniture. Those of ``tags`` with a
-    facing (direction of the front) are drawn on the surfaces as small labels."""
+    """Return the building of a plan with random textures and random heights of furniture. ``tags``: those with a facing
+    (direction of the front) are drawn on the surfaces as small labels."""
     walls, boxes = plan.faces()
     doors = np.array([side for door in plan.doors for side in both_sides(door)]).reshape(-1, 4)
     faces = np.concatenate((walls, boxes, doors))

@@ -199,8 +199,8 @@ EXCLUSIVE = (("tags", "density"), ("antennas", "preset"))  # pairs of keys: a ch
 
 
 def merged(base: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the nested table ``base`` with the values of ``changes``. If a table in ``changes`` has another value of
-    the key ``kind`` than in ``base``, it replaces the whole table."""
+    """Return the nested table ``base`` with the values of ``changes``. A table in ``changes`` with another value of the
+    key ``kind`` replaces the whole table in ``base``."""
     if "kind" in changes and changes["kind"] != base.get("kind"):
         return dict(changes)
     out = dict(base)

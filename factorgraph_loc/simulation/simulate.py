@@ -63,11 +63,8 @@ def generator(seed: int | Any, name: str, names: tuple[str, ...] = NAMES) -> np.
 
 
 def drive(world: World, settings: DriveSettings, rng: np.random.Generator) -> Trajectory:
-    """Return the poses of a simulated robot that drives between random places of a world. Their rate is
-    ``settings.rate``, and they start at t = 0.
-
-    Raises InputError if the world has no room to drive in.
-    """
+    """Return the poses of a simulated robot that drives between random places of a world, from t = 0 on. The rate of
+    the poses is ``settings.rate``. Raises InputError if the world has no room to drive in."""
     space = free_space(world, settings.clearance)
     start = int(rng.integers(len(space.centres)))
     length, parts = 0.0, [space.centres[start][None]]
@@ -145,9 +142,9 @@ def simulate(settings: SimulationSettings, seed: int) -> Log:
 
 
 def simulated(function: Callable[[Ride], Simulated], ride: Ride, name: str) -> Simulated:
-    """Return the simulated measurements of the sensor ``name`` on a drive. ``function``: simulates a sensor of this
-    kind. ``ride``: the drive.
+    """Return the simulated measurements of the sensor ``name`` on a drive.
 
+    ``function``: simulates a sensor of this kind. ``ride``: the drive, with its world, settings and random generators.
     If a rig has several sensors of one kind, such as ``camera.front``, each has random generators of its own.
     """
     kind, _, own = name.partition(".")

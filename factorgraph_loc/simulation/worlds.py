@@ -52,8 +52,8 @@ class Plan:
         return np.array([*self.walls, *(side for box in self.boxes for side in _sides(box))])
 
     def faces(self) -> tuple[Array, Array]:
-        """Return the faces of walls, then the faces of boxes, each as segments (F, 4) with the free side on their left.
-        An inner wall has two faces."""
+        """Return the faces of walls, and the faces of boxes, as two arrays of segments (F, 4). The free side is on the
+        left of a segment. An inner wall has two faces."""
         walls = np.array([face for wall in self.walls for face in both_sides(wall)]).reshape(-1, 4)
         middles = _places(walls, np.full(len(walls), 0.5))[:, :2]
         boxes = [(x2, y2, x1, y1) for box in self.boxes for x1, y1, x2, y2 in _sides(box)]
@@ -176,8 +176,9 @@ def _sides(box: Segment) -> list[Segment]:
 def make_world(settings: WorldSettings, rng: np.random.Generator) -> World:
     """Return a map with tags ``T000``..., landmarks ``L000``... and points ``P0000``.... Boxes count as walls.
 
-    A tag on a surface faces away from the surface. Hanging tags, and tags on the floor at height 0, have no direction.
-    Raises InputError if the plan has too few places for the tags.
+    ``settings``: kind and size of the building, and numbers of objects. A tag on a surface faces away from the surface.
+    Hanging tags, and tags on the floor at height 0, have no direction. Raises InputError if the plan has too few places
+    for the tags.
     """
     plan = make_plan(settings, rng)
     tags: dict[str, Tag] = {}

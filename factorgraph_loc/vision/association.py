@@ -70,7 +70,8 @@ NONE = Associations(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64))
 
 
 class Associator:
-    """Matches features of images to the points of a map. ``feature``: kind of the map's features, such as "sift"."""
+    """Matches features of images to the points of a map. ``points``: the map of points. ``model``: the calibration of
+    the camera in the rig. ``feature``: kind of the map's features, such as "sift"."""
 
     def __init__(self, points: PointMap, model: CameraModel) -> None:
         self.feature = points.feature
@@ -201,10 +202,10 @@ class Associator:
         return np.asarray(distances(pairs, begins, views, self._numbers, _numbers(frame_descriptors)))
 
     def _cost_limit(self) -> float:
-        """Return the largest distance of descriptors that a match may have, squared unless descriptors are binary.
+        """Return the largest distance between descriptors that a match may have, squared unless descriptors are binary.
 
         Only the fraction :data:`CHANCE` of the pairs of different map points has a smaller distance. The result is
-        infinite if the map is too small to estimate this.
+        infinite if the map has too few points to estimate this.
         """
         if len(self._starts) < 3 or len(self._owners) == 0:
             return math.inf

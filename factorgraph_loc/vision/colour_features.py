@@ -58,9 +58,10 @@ class ColourExtractor:
     """Extractor of colour features (see :class:`~factorgraph_loc.vision.keypoints.Extractor`).
 
     The descriptors (N, 35) are ``float32`` and of unit length. ``count``: the largest number of features per image.
-    ``everywhere``: choose features in all parts of an image, not only the strongest. ``paper_literal``: compute
-    descriptors exactly as Raoui et al. 2011, for comparison (see :func:`~factorgraph_loc.vision.descriptor.records`).
-    An extractor is not thread-safe, because it reuses the memory of the previous image.
+    ``everywhere``: True to choose features in all parts of an image, False to choose the strongest. ``paper_literal``:
+    compute descriptors exactly as Raoui et al. 2011, for comparison (see
+    :func:`~factorgraph_loc.vision.descriptor.records`). An extractor is not thread-safe, because it reuses the memory
+    of the previous image.
     """
 
     def __init__(self, count: int, *, everywhere: bool = False, paper_literal: bool = False) -> None:

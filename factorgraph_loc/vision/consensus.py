@@ -38,7 +38,8 @@ JOINT = 0.99  # probability of the joint compatibility test
 @dataclass(frozen=True)
 class CameraPose:
     """A camera pose. ``position`` (3,) [m]: in the world frame. ``rotation`` (3, 3): from the camera frame to the world
-    frame. ``covariance`` (6, 6): of a perturbation in the camera frame, rotation [rad] before translation [m]."""
+    frame. ``covariance`` (6, 6): of a perturbation in the camera frame, in the order rotation [rad], translation
+    [m]."""
 
     position: Array
     rotation: Array
@@ -46,10 +47,11 @@ class CameraPose:
 
 
 def are_compatible(model: CameraModel, camera: CameraPose, points: Array, pixels: Array, covariances: Array) -> bool:
-    """True if K observed points together pass a chi-square test against the predicted pose ``camera``.
+    """True if K observed points together pass a chi-square test against the predicted camera pose ``camera``.
 
-    ``points`` (K, 3) [m]: positions in the world frame. ``pixels`` (K, 2): the observed pixels. ``covariances``
-    (K, 2, 2) [px^2]: of the errors of these pixels, without the uncertainty of the pose.
+    ``model``: the calibration of the camera. ``points`` (K, 3) [m]: positions in the world frame. ``pixels`` (K, 2):
+    the observed pixels. ``covariances`` (K, 2, 2) [px^2]: of the errors of these pixels, without the uncertainty of the
+    pose.
     """
     arrays = (np.ascontiguousarray(part, dtype=float) for part in (points, pixels, covariances))
     try:
@@ -62,7 +64,8 @@ def are_compatible(model: CameraModel, camera: CameraPose, points: Array, pixels
 def agreeing(model: CameraModel, camera: CameraPose, points: Array, pixels: Array, covariances: Array) -> Truths:
     """Return a mask (K,) of the observed points that agree on one camera pose near the predicted pose ``camera``.
 
-    ``points``, ``pixels``, ``covariances``: see :func:`are_compatible`. All points are inliers if they are jointly
+    ``model``: the calibration of the camera. ``points`` (K, 3) [m]: positions in the world frame. ``pixels`` (K, 2):
+    the observed pixels. ``covariances`` (K, 2, 2) [px^2]: of their errors. All points are inliers if they are jointly
     compatible with the prediction. Otherwise at least :data:`FEWEST` points must agree, or none is an inlier.
     """
     count = len(points)

@@ -47,7 +47,7 @@ def detect(space: ScaleSpace, colours: list[Float], count: int, *, everywhere: b
     """Return the corners in an image, at most ``count``, by descending response.
 
     ``space``: the scale space of the image's intensity. ``colours``: the colour channels (H, W), empty for a grey
-    image. ``everywhere``: choose points in all parts of the image, not only the strongest.
+    image. ``everywhere``: True to choose points in all parts of the image, False to choose the strongest.
     """
     corners = np.vstack(_corners(space, colours))
     corners = corners[np.argsort(-corners[:, 3], kind="stable")]

@@ -80,8 +80,8 @@ class FeatureCache:
         self.fault = ""
 
     def read(self, key: str) -> bytes | None:
-        """Return the bytes stored under ``key``, None if missing or damaged. This updates the time of their last
-        use."""
+        """Return the bytes stored under ``key``, or None if they are missing or damaged. The entry then counts as just
+        used."""
         path = self._path(key)
         try:
             stored = read_bytes(path, DATA)
@@ -97,7 +97,7 @@ class FeatureCache:
         return content
 
     def write(self, key: str, content: bytes) -> None:
-        """Store ``content`` under ``key``, atomically. If it cannot be written, ``fault`` is set but no error
+        """Store ``content`` under ``key``, atomically. If this fails, ``fault`` is set to a message, and no error is
         raised."""
         if self.fault:
             return

@@ -23,7 +23,7 @@ class OpenCvExtractor:
     """An :class:`Extractor` that uses a feature of OpenCV.
 
     ``create``: the function of OpenCV that creates the feature. ``count``: the largest number of features per image.
-    ``everywhere``: choose features in all parts of an image, not only the strongest.
+    ``everywhere``: True to choose features in all parts of an image, False to choose the strongest.
     """
 
     def __init__(self, create: Callable[..., cv2.Feature2D], count: int, *, everywhere: bool = False) -> None:
@@ -65,8 +65,8 @@ EXTRACTORS: dict[str, Callable[..., Extractor]] = {
 def extractor(name: str, count: int = 1000, *, everywhere: bool = False) -> Extractor:
     """Return a new extractor of features. ``name``: a key of :data:`EXTRACTORS`, such as "sift".
 
-    ``count``: the largest number of features per image. ``everywhere``: choose features in all parts of an image, not
-    only the strongest. Raises InputError for an unknown name or a ``count`` below 1.
+    ``count``: the largest number of features per image. ``everywhere``: True to choose features in all parts of an
+    image, False to choose the strongest. Raises InputError for an unknown name or a ``count`` below 1.
     """
     if name not in EXTRACTORS:
         raise InputError(f"feature {quoted(name)} is not known{nearest(name, sorted(EXTRACTORS))}")

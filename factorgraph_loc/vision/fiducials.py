@@ -29,7 +29,8 @@ MIN_CONTRAST = 20.0  # grey levels across an edge; an edge with less contrast is
 def refined_corners(grey: Image, corners: Array, bits: int) -> Array:
     """Return the corners (4, 2) [px] of a marker, refined to subpixels. Corners at faint or short edges are unchanged.
 
-    ``corners`` (4, 2) [px]: the detected corners. ``bits``: number of cells along a side, including the black border.
+    ``corners`` (4, 2) [px]: the detected corners. ``bits``: number of cells along a side of the marker, including the
+    black border.
     """
     for _ in range(PASSES):
         corners = _intersections(grey, corners, bits)
@@ -101,9 +102,9 @@ def _line(grey: Image, start: Array, end: Array, middle: Array, reach: float) ->
 
 
 def find_markers(image: Image, family: MarkerFamily) -> list[tuple[int, Array]]:
-    """Return the number and the corners (4, 2) [px] of each marker of a ``family`` that is detected in an image.
+    """Return (number, corners) of each fiducial marker of a ``family`` that is detected in an image.
 
-    The order of the corners is upper left, upper right, lower right, lower left of the printed marker. Markers with the
+    ``corners`` (4, 2) [px]: upper left, upper right, lower right, lower left of the printed marker. Markers with the
     same number in one image are omitted, because at most one of them can be genuine.
     """
     grey = image if image.ndim == 2 else np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY), dtype=np.uint8)

@@ -31,7 +31,7 @@ class CameraFrame:
 
     @property
     def frame(self) -> "CameraFrame":
-        """This object. Camera measurements without features have the value None for this property."""
+        """This object itself. Other measurements of a camera, which have no features, return None."""
         return self
 
     @property

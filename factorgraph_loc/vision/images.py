@@ -67,7 +67,7 @@ def decoded(content: bytes, source: object, flags: int) -> NDArray[Any]:
 
     ``content``: the bytes of the file. ``source``: its name, for error messages. ``flags``: see ``cv2.imdecode``.
     Raises InputError if the bytes are no image, or if it has more than :data:`~factorgraph_loc.files.bounded.PIXELS`
-    pixels. This is checked before memory is allocated. OpenCV itself would allow 2^30 pixels.
+    pixels. The number is checked before memory is allocated, because OpenCV itself allows 2^30 pixels.
     """
     image_size(content, source)
     with foreign(source, NO_IMAGE), quiet():

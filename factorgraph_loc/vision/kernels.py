@@ -25,11 +25,10 @@ FAST = {"contract", "reassoc"}
 
 @compiled(nogil=True, fastmath=FAST)
 def structure_tensor(intensity: Float, colours: Float, products: Float) -> None:
-    """Compute the products of first derivatives of an image, summed over its channels.
+    """Write the products of first derivatives of an image, summed over its channels, to ``products``.
 
-    ``intensity`` (H, W), ``colours`` (C, H, W): the channels. ``products`` (3, H, W): receives the sums of dx dx, dx dy
-    and dy dy. Derivatives are central differences, halved in the first and last row, and 0 in the first and last
-    column.
+    ``intensity`` (H, W), ``colours`` (C, H, W): the channels. ``products`` (3, H, W): the sums of dx dx, dx dy and dy
+    dy. Derivatives are central differences, halved in the first and last row, and 0 in the first and last column.
     """
     height, width = intensity.shape
     xx, xy, yy = products[0], products[1], products[2]
@@ -52,10 +51,11 @@ def structure_tensor(intensity: Float, colours: Float, products: Float) -> None:
 
 @compiled(nogil=True, fastmath=FAST)
 def corner_strength(products: Float, scale: np.float32, strength: Float) -> None:
-    """Compute the Harris corner measure of each pixel: determinant over trace of the second moment matrix.
+    """Write the Harris corner measure of each pixel to ``strength``.
 
-    The measure is multiplied by ``scale``. Without it, it is half the harmonic mean of the eigenvalues. ``products``
-    (3, H, W): the elements xx, xy, yy of the matrix at each pixel. ``strength`` (H, W): receives the result.
+    The measure is the determinant over the trace of the second moment matrix, multiplied by ``scale``. ``products`` (3,
+    H, W): the elements xx, xy, yy of the matrix at each pixel. With a ``scale`` of 1, the measure is half the harmonic
+    mean of the eigenvalues. ``strength`` (H, W): receives the result.
     """
     xx, xy, yy = products[0], products[1], products[2]
     height, width = strength.shape
@@ -80,14 +80,14 @@ def _laplacian_near(plane: Float, y: int, x: int, weight: float) -> float:
 def refined_peaks(
     strength: Float, threshold: float, planes: Float, variances: Array, pixels: Int32, peaks: Array
 ) -> int:
-    """Select the local maxima of the corner strength that are also maxima over scale. Return their number.
+    """Write the corners of an image to the first rows of ``peaks``, and return their number.
 
     ``strength`` (H, W): the corner strength. ``pixels`` (N, 2): x and y of its local maxima. ``planes`` (3, H, W): the
-    intensity at three consecutive scales with ``variances`` (3,) [px^2]. A selected pixel has a strength above
-    ``threshold``, and the largest normalised Laplacian near it is in the middle plane.
+    intensity at three consecutive scales with ``variances`` (3,) [px^2]. A maximum is a corner if its strength is above
+    ``threshold``. In addition, the normalised Laplacian near it must be largest in the middle plane.
 
-    ``peaks`` (N, 5): receives a row for each selected pixel. Its values are x and y [px], refined by a paraboloid
-    through 3x3 strengths; the refined scale, in planes from the middle plane; the strength; the absolute Laplacian.
+    ``peaks`` (N, 5): the columns are x and y [px], refined by a paraboloid through 3x3 strengths; the refined scale, in
+    planes from the middle plane; the strength; the absolute Laplacian.
     """
     count = 0
     for n in range(len(pixels)):
@@ -146,12 +146,12 @@ def locally_strongest(points: Float, scales: Float, reach: float, alike: float, 
 
 @compiled(nogil=True, fastmath=FAST)
 def sample_patches(planes: Float, starts: Int64, shapes: Int64, frames: Float, offsets: Float, patches: Float) -> None:
-    """Sample rotated and scaled patches around N points by bilinear interpolation, each in its own plane of a pyramid.
+    """Write samples of rotated and scaled patches around N points to ``patches`` (N, M), by bilinear interpolation.
 
-    ``planes`` (T,): the pixels of all planes, row by row. ``starts`` (N,): index of the first pixel of each point's
-    plane. ``shapes`` (N, 2): height and width of the plane. ``frames`` (N, 4) [px]: x and y of the point in its plane,
-    and the x axis (a, b) of the patch's frame. The length of this axis is the unit of ``offsets`` (M, 2), the sampled
-    places in this frame. ``patches`` (N, M): receives the samples. Outside the plane the nearest pixel is used.
+    Each point is in its own plane of a pyramid. ``planes`` (T,): the pixels of all planes, row by row. ``starts`` (N,):
+    index of the first pixel of each point's plane. ``shapes`` (N, 2): height and width of the plane. ``frames`` (N, 4)
+    [px]: x and y of the point in its plane, and the x axis (a, b) of the patch's frame. The length of this axis is the
+    unit of ``offsets`` (M, 2), the sampled places in this frame. Outside the plane the nearest pixel is used.
     """
     for n in range(len(frames)):
         start, height, width = starts[n], shapes[n, 0], shapes[n, 1]
@@ -171,11 +171,11 @@ def sample_patches(planes: Float, starts: Int64, shapes: Int64, frames: Float, o
 
 @compiled(nogil=True)
 def orientation_histograms(patches: Float, side: int, weights: Float, histograms: Float) -> None:
-    """Compute histograms of the gradient directions in patches.
+    """Add histograms of the gradient directions in N patches to ``histograms`` (N, bins).
 
     ``patches`` (N, side * side): the samples of each patch, row by row. ``weights`` (side - 2, side - 2): weights of
-    the gradients, in addition to their magnitude. ``histograms`` (N, bins): the result is added here. Bin 0 is centred
-    at direction 0. Each gradient is distributed over the two nearest bins.
+    the gradients, in addition to their magnitude. Bin 0 is centred at direction 0. Each gradient is distributed over
+    the two nearest bins.
     """
     bins = histograms.shape[1]
     per_radian = np.float32(bins / (2.0 * math.pi))

@@ -82,8 +82,8 @@ def spread_out(pixels: Array, count: int, priority: Sequence[int] | None = None,
     """Return the indices of at most ``count`` pixels that are distributed over the image, in ascending order.
 
     ``pixels`` (K, 2) [px]: divided into the cells of a grid. One pixel is taken from each cell in turn, until there are
-    enough. ``cells``: the approximate number of cells, ``count`` if None. ``priority`` (K,): pixels with a higher
-    priority are taken first in their cell. None means the order of ``pixels``.
+    enough. ``cells``: the approximate number of cells, None for ``count`` cells. ``priority`` (K,): in each cell,
+    pixels with a higher priority are taken first. None means the order of ``pixels``.
     """
     if len(pixels) <= count:
         return np.arange(len(pixels))

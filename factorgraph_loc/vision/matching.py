@@ -72,7 +72,7 @@ def match(
 
 
 def gates(predicted: Array, covariances: Array, points: Array) -> Truths:
-    """Return a mask (N, M) that is true if a measured pixel lies in the gate of a predicted pixel.
+    """Return a mask (N, M) that is True if a measured pixel lies in the gate of a predicted pixel.
 
     A gate is the ellipse that contains the measured pixel with the probability :data:`GATE`. The mask can be passed to
     :func:`match` as ``allowed``. ``predicted`` (N, 2) [px]: predicted pixels. ``covariances`` (N, 2, 2) [px^2]: of the

@@ -63,10 +63,11 @@ class FoundOnFloor:
 
 
 def located(model: CameraModel, points: Array, pixels: Array, covariances: Array | None = None) -> Resection | None:
-    """Return the camera pose computed from K observed points, without a prediction. Outliers are rejected.
+    """Return the camera pose computed from K observed points, without a prediction, and a mask of the inliers.
 
-    ``points`` (K, 3) [m]: positions in the world frame. ``pixels`` (K, 2): their observed pixels. ``covariances``
-    (K, 3, 3) [m^2]: of the positions, None if these are exact. Returns None if the points do not determine the pose.
+    ``model``: the calibration of the camera. ``points`` (K, 3) [m]: positions in the world frame. ``pixels`` (K, 2):
+    their observed pixels. ``covariances`` (K, 3, 3) [m^2]: of the positions, None if these are exact. Returns None if
+    the points do not determine the pose.
     """
     if len(points) < FEWEST:
         return None
@@ -92,10 +93,12 @@ def located(model: CameraModel, points: Array, pixels: Array, covariances: Array
 def on_floor(
     model: CameraModel, camera: CameraPose, points: Array, pixels: Array, covariances: Array | None = None
 ) -> FoundOnFloor | None:
-    """Return the planar pose of a robot on the floor by least squares. ``camera``: the initial pose of its camera.
+    """Return the planar pose of a robot on the floor from K observed points by least squares.
 
-    ``points`` (K, 3), ``pixels`` (K, 2), ``covariances`` (K, 3, 3): see :func:`located`. Returns None if this camera
-    pose means a tilted robot or one above the floor. Also returns None if the points do not determine the planar pose.
+    ``model``: the calibration of the camera and its position on the robot. ``camera``: the initial pose of the camera.
+    ``points`` (K, 3) [m]: positions in the world frame. ``pixels`` (K, 2): their observed pixels. ``covariances`` (K,
+    3, 3) [m^2]: of the positions, None if these are exact. Returns None if ``camera`` means a tilted robot or one above
+    the floor. Also returns None if the points do not determine the planar pose.
     """
     position, rotation = reprojection.carrier(model, camera.position, camera.rotation)
     tilt = math.acos(float(np.clip(rotation[2, 2], -1.0, 1.0)))
@@ -156,7 +159,9 @@ def found_on_floor(
 ) -> FoundOnFloor | None:
     """Return the planar pose of a robot on the floor from K observed points, without a prediction, and reject outliers.
 
-    Arguments: see :func:`located`. Returns None if the points do not determine a pose on the floor.
+    ``model``: the calibration of the camera and its position on the robot. ``points`` (K, 3) [m]: positions in the
+    world frame. ``pixels`` (K, 2): their observed pixels. ``covariances`` (K, 3, 3) [m^2]: of the positions, None if
+    these are exact. Returns None if the points do not determine a pose on the floor.
     """
     resection = located(model, points, pixels, covariances)
     if resection is None:

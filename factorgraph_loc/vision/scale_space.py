@@ -70,7 +70,8 @@ class ScaleSpace:
         self._steps: Array = np.array([2.0**o for o, _ in levels])
 
     def fill(self, intensity: Float) -> None:
-        """Compute the planes of all octaves from the ``intensity`` (H, W) of an image."""
+        """Blur the ``intensity`` (H, W) of an image to all scales, and write the results to the planes of the
+        octaves."""
         blur(intensity, self.octaves[0].planes[0], SIGMAS[0])
         for o, octave in enumerate(self.octaves):
             if o > 0:
@@ -79,8 +80,8 @@ class ScaleSpace:
                 blur(octave.planes[i - 1], octave.planes[i], more_blur(SIGMAS[i - 1], SIGMAS[i]))
 
     def levels(self, sigmas: Array) -> Integers:
-        """Return the index (N,) of the characteristic scale nearest to each of ``sigmas`` (N,) [px]. The indices begin
-        at the finest scale and continue over all octaves."""
+        """Return the indices (N,) of the blurs of the scale space that are nearest to ``sigmas`` (N,) [px]. The indices
+        begin at the smallest blur, and continue over all octaves."""
         nearest = np.rint(SCALES * np.log2(sigmas / FINEST))
         return np.asarray(np.clip(nearest, 0, len(self._steps) - 1), dtype=np.int64)
 

@@ -36,7 +36,8 @@ class _TrackedImage(NamedTuple):
 class FeatureTracker:
     """Assigns track numbers to the features of consecutive images. Features with the same number show the same point.
 
-    Pass the images in order of time. A track may miss one image, but not two in succession. Not thread-safe.
+    Call :meth:`follow` for each image in order of time. A track may miss one image, but not two in succession. Not
+    thread-safe.
     """
 
     def __init__(self, camera: CameraModel) -> None:
@@ -100,7 +101,8 @@ def pairs(first: tuple[Array, Descriptors], second: tuple[Array, Descriptors], c
 
 
 def _of_one_geometry(first: Float, second: Float, focal: float) -> Truths:
-    """Return a mask (M,) of the pairs of pixels that fit one essential matrix. All are True if none can be estimated.
+    """Return a mask (M,) of the pairs of pixels that fit one essential matrix. All are True if no matrix can be
+    estimated.
 
     ``first``, ``second`` (M, 2) [px]: pixels relative to the principal point. ``focal`` [px]: the focal length.
     """
