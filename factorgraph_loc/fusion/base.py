@@ -42,11 +42,12 @@ class Estimator(Protocol):
         """
 
     def process(self, measurement: Measurement) -> None:
-        """Process one measurement. If it is late by more than the setting ``max_delay``, it is counted and ignored."""
+        """Process one measurement. A measurement that is older than the newest one by more than the setting
+        ``max_delay`` is counted and ignored."""
 
     def estimate(self, t: float | None = None) -> PoseEstimate:
         """Return the pose at the time of the newest measurement, estimated from all measurements so far. If ``t`` [s]
-        is later, the pose is predicted to ``t`` by odometry."""
+        is later, the pose is predicted by odometry to ``t``."""
 
     def belief(self, t: float | None = None) -> Belief:
         """Return the probability distribution of the pose, at the same time as :meth:`estimate` with the same ``t``
@@ -63,7 +64,7 @@ class Estimator(Protocol):
 
 @runtime_checkable
 class ConcludingEstimator(Protocol):
-    """An estimator that computes its final trajectory separately, after the last measurement. This computation may add
+    """An estimator that computes its final trajectory in a separate step after the last measurement. This step may add
     diagnostics."""
 
     def final_diagnostics(self) -> Diagnostics:
@@ -76,7 +77,8 @@ class ForgettingEstimator(Protocol):
     memory."""
 
     def forget(self, until: float) -> None:
-        """Delete the trajectory before the time ``until`` [s], except for what late measurements can still change."""
+        """Delete the trajectory before the time ``until`` [s]. The part that a measurement with a delay up to
+        ``max_delay`` can still change is not deleted."""
 
 
 @runtime_checkable
@@ -89,8 +91,8 @@ class RecordingEstimator(Protocol):
 
 
 def record_each(estimator: Estimator, ticks: Sequence[float]) -> list[PoseEstimate]:
-    """Return the estimate at each of the times ``ticks`` [s]. Each time is then processed by the estimator, like a
-    measurement."""
+    """Return the estimate at each of the times ``ticks`` [s]. The estimator also processes each time like a
+    measurement, so that its trajectory contains it."""
     estimates = []
     for t in ticks:
         estimates.append(estimator.estimate(t))

@@ -73,8 +73,8 @@ class Cloud:
         return errors, *vector_moments(errors, self.weights)
 
     def with_block(self, name: str, mean: Array, covariance: Array, rng: np.random.Generator) -> Cloud:
-        """Return the particles with ``d`` more constants. Each particle's values are drawn from a Gaussian with
-        ``mean`` (d,) and ``covariance`` (d, d). ``name``: the name of the sensor."""
+        """Return the particles with ``d`` additional constants of the sensor ``name``. Each particle's values are drawn
+        from a Gaussian with ``mean`` (d,) and ``covariance`` (d, d)."""
         first = self.constants.shape[1]
         drawn = mean + positive.draws(covariance, len(self.poses), rng)
         parts = {**self.parts, name: slice(first, first + len(mean))}
@@ -89,7 +89,8 @@ class Cloud:
         return replace(self, log_weights=log_weights), float(weighed[heaviest] - log_weights[heaviest])
 
     def thinned(self, count: int) -> Cloud:
-        """Return only every k-th particle, so that about ``count`` particles remain. Their weights are normalised."""
+        """Return every k-th particle, with k chosen so that about ``count`` particles remain. Their weights are
+        normalised."""
         some = slice(None, None, max(1, len(self.poses) // count))
         weights = normalised(self.log_weights[some])
         return replace(self, poses=self.poses[some], constants=self.constants[some], log_weights=weights)
@@ -158,7 +159,8 @@ class Cloud:
 
 class Corrected(NamedTuple):
     """Particles after a correction by a likelihood. ``evidence``: the logarithm of the likelihood's mean over the
-    particles. ``left``: the part of the exponent 1 of the likelihood that is not yet applied, see :func:`corrected`."""
+    particles. ``left``: the sum of the likelihood's exponents that are not yet applied, 0 after a complete
+    correction."""
 
     cloud: Cloud
     evidence: float
@@ -179,15 +181,15 @@ def corrected(
     """Correct particles by a likelihood in several steps (Musso, Oudjane, Le Gland, in "Sequential Monte Carlo Methods
     in Practice", 2001, section 12.4).
 
-    Each step multiplies the weights by a power of the likelihood, then resamples. The exponents have the sum ``left``.
-    Each exponent is the largest that keeps enough effective particles.
+    Each step multiplies the weights by a power of the likelihood, then resamples. The exponents of all steps have the
+    sum ``left``. Each exponent is the largest that keeps enough effective particles.
 
     ``likelihood(cloud)``: computes the log-likelihood (N,) of the measurement. ``resampled(cloud)``: computes a
     resampled cloud. ``enough(cloud)``: returns the minimum effective number of particles after a step. ``t`` [s]: the
     time of the measurement, for errors. ``below``: after the last step, particles are resampled only if the effective
     number is below this fraction of N. ``to_end``: False to omit the last step.
 
-    Returns a generator, which yields the computing cost of each part and returns a :class:`Corrected`. Raises
+    Returns a generator. It yields the computing cost of each part, and its return value is a :class:`Corrected`. Raises
     RunFailedError if no particle with a nonzero weight has a finite log-likelihood.
     """
     evidence = 0.0
@@ -215,7 +217,7 @@ def in_one_step(function: Callable[[Cloud], T]) -> Callable[[Cloud], Steps[T]]:
 
 
 def finished(steps: Steps[T]) -> T:
-    """Run a generator to its end. Returns the value of its ``return`` statement."""
+    """Run the generator ``steps`` to its end. Returns the value of its ``return`` statement."""
     while True:
         try:
             next(steps)
@@ -272,8 +274,8 @@ def largest_share(log_weights: Array, likelihood: Array, left: float, enough: fl
 
 
 def weighable(likelihood: Array, log_weights: Array, t: float) -> Array:
-    """Return a log-likelihood (N,) with ``-inf`` instead of values that are not finite, so that these particles get the
-    weight 0.
+    """Return a ``likelihood`` (N,), the log-likelihoods of particles, with ``-inf`` instead of values that are not
+    finite. These particles then get the weight 0.
 
     ``log_weights`` (N,): the particles' log-weights. ``t`` [s]: the time of the measurement, for errors. Raises
     RunFailedError if no particle with a nonzero weight has a finite log-likelihood.
@@ -319,7 +321,8 @@ def vector_moments(values: Array, weights: Array) -> tuple[Array, Array]:
 
 
 def _inflated(covariance: Array, lost: float) -> Array:
-    """Return a covariance divided by ``1 - lost``."""
+    """Return a ``covariance`` divided by ``1 - lost``. ``lost``: a fraction from 0 to 0.5; larger values count as
+    0.5."""
     return covariance / max(1.0 - lost, 0.5)
 
 

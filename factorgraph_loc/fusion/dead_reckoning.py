@@ -35,7 +35,8 @@ class DeadReckoning(Filter):
     _state: tuple[Array, Array]  # pose (3,), and its body-frame covariance (3, 3)
 
     def trajectory(self) -> Trajectory:
-        """Return the recorded estimates. No later measurement can improve them."""
+        """Return the estimates during the run, at the times at which the run recorded the pose. They are not
+        smoothed."""
         records: list[_PoseRecord] = self._records
         return at_ticks(
             self._ticks,

@@ -77,14 +77,15 @@ class _State(NamedTuple):
         return self._replace(rest=self.rest[: size - POSE], covariance=self.covariance[:size, :size])
 
     def on_pose(self, observation: Observation) -> Observation:
-        """Return an observation of this state as a function of the pose only. Constants and landmarks are fixed at
-        their values in this state, and their covariances are added to the noise."""
+        """Return ``observation`` as a function of the pose only. Constants and landmarks are fixed at their values in
+        this state, and their covariances are added to the noise."""
         values, columns = self.layout.values(self.rest), self.layout.columns
         spreads = {name: self.covariance[columns[name], columns[name]] for name in observation.blocks}
         return observation.on_pose({name: values[name] for name in spreads}, spreads)
 
     def with_block(self, new: NewVariable) -> _State:
-        """Return the state with the variable ``new``, such as a landmark, added at the end, with its correlations."""
+        """Return the state with the variable ``new``, such as a landmark, added at the end. Its correlations with the
+        other variables are included."""
         size, columns = len(self.covariance), self.layout.columns
         cross, own = new.joint(self.covariance, columns)
         end = size + len(new.mean)
@@ -240,8 +241,9 @@ class Ekf(Filter):
         ((self._odometry, self._step, self._state, _),) = self._predictions((t,))
 
     def _predictions(self, times: Sequence[float]) -> list[tuple[ChainState, _Step, _State, Array]]:
-        """Return predictions of the state to each of ``times`` [s] in turn. Each is a tuple: the integrated odometry,
-        the step from the previous time, the predicted state, and the pose's covariance (3, 3) in the world frame."""
+        """Return (odometry, step, state, covariance) for each of ``times`` [s]: the integrated odometry, the prediction
+        step from the previous of these times, the predicted state, and the pose's covariance (3, 3) in the world
+        frame."""
         s = self._state
         part = s.layout.columns.get(MOTION, NOWHERE)
         constants = s.rest[part.start - POSE : part.stop - POSE]
@@ -302,8 +304,8 @@ class Ekf(Filter):
         return self._start(self._search.brought(pose, self._odometry))
 
     def _jump(self, best: PosePrior, refuted: Refuted) -> None:
-        """Continue at the pose ``best``, without correlation with other variables. The sensor constants are reset to
-        their estimates from before ``refuted.since``, when the estimated pose became wrong."""
+        """Replace the estimated pose by ``best``, without correlation with other variables. The sensor constants are
+        reset to their estimates from before ``refuted.since``, the time when the estimated pose became wrong."""
         self._search.begin_track(by_search=True)
         for sensor in self._sensors.values():
             sensor.restart(refuted.since)
@@ -320,7 +322,8 @@ class Ekf(Filter):
         return PoseEstimate(self._t, pose, covariance, self._status(doubted=is_doubted(self._sensors.values())))
 
     def _status(self, *, doubted: bool) -> Status:
-        """Return the status of the present estimate. ``doubted``: True if a sensor contradicts it."""
+        """Return the status of the current estimate, "ambiguous" or "localized". ``doubted``: True if a sensor
+        contradicts it."""
         unsure = doubted or self._search.is_unsure(self._t, self._state.covariance)
         return "ambiguous" if unsure else "localized"
 
@@ -334,6 +337,6 @@ class Ekf(Filter):
 
 
 def _at_its_time(observation: Observation, state: _State) -> Observation | None:
-    """Return an observation as a function of the pose at its own time. Returns None if this is impossible. Constants
-    and landmarks are fixed at ``state``."""
+    """Return ``observation`` as a function of the pose at its own time, with constants and landmarks fixed at
+    ``state``. Returns None if the observation does not implement this."""
     return state.on_pose(observation).at_its_time()

@@ -37,12 +37,9 @@ class FilterSettings(FileModel):
 
 
 class Checkpoint(NamedTuple):
-    """A copy of a filter's state, to return to if a late measurement arrives.
-
-    ``state``: the estimate. ``t`` [s]: its time. ``odometry``: the integrated odometry at ``t``. ``records``: the
-    number of records stored for smoothing so far. ``ticks``: the number of times so far at which the run recorded the
-    pose.
-    """
+    """A copy of a filter's state, to restore if a measurement arrives after newer ones. ``state``: the estimate. ``t``
+    [s]: its time. ``odometry``: the integrated odometry at ``t``. ``records``: the number of records stored for
+    smoothing so far. ``ticks``: the number of times so far at which the run recorded the pose."""
 
     state: Any
     t: float
@@ -70,7 +67,8 @@ class FilterView:
     def value(self, name: str) -> Array | None: ...
 
     def poses_at(self, times: Array) -> Array:
-        """Return the robot's poses (N, 3) at earlier ``times`` (N,) [s] by odometry, relative to its present pose."""
+        """Return the robot's poses (N, 3) at earlier ``times`` (N,) [s] by odometry, in the frame of its current
+        pose."""
         constants = self.value(MOTION)
         values = np.zeros(0) if constants is None else constants
         return np.asarray(self._filter._motion.poses_at(self._filter._odometry, times, values))
@@ -80,12 +78,12 @@ class FilterView:
         return None
 
     def track(self) -> Tracked:
-        """Return the present estimate of the pose, its covariance, and the integrated odometry at the present time."""
+        """Return the current estimate of the pose, its covariance, and the integrated odometry at the same time."""
         return Tracked(self._filter._odometry, self.pose, self.covariance)
 
     def pose_back(self, t: float, pose: Array) -> Array:
-        """Return the robot's pose (3,) at an earlier time ``t`` [s], computed from its present ``pose`` (3,) by
-        odometry."""
+        """Return the robot's pose (3,) in the world frame at an earlier time ``t`` [s]. It is computed by odometry from
+        its current ``pose`` (3,)."""
         return se2.compose(pose, self.poses_at(np.array([t]))[0])
 
 
@@ -120,8 +118,8 @@ class Filter(Timeline):
         self._taken.clear()
 
     def _wait(self, t: float) -> None:
-        """Reset the filter to wait for a start at or after time ``t`` [s]. :meth:`_begin` then processes the
-        measurements."""
+        """Reset the filter, so that it waits for a start at or after time ``t`` [s]. Until then :meth:`_begin`
+        processes the measurements."""
         self._t, self._begun, self._state = t, math.inf, None
         self._taken.clear()
 
@@ -134,7 +132,8 @@ class Filter(Timeline):
         return Learnt()
 
     def forget(self, until: float) -> None:
-        """Delete the trajectory before the time ``until`` [s], except for what late measurements can still change."""
+        """Delete the trajectory before the time ``until`` [s]. The part that a measurement with a delay up to
+        ``max_delay`` can still change is not deleted."""
         self._ahead = None
         t = min(until, self._t - self._max_delay)
         records = max(0, bisect.bisect_left(self._records, t, key=lambda record: record.t) - 1)
@@ -152,7 +151,7 @@ class Filter(Timeline):
 
     @abstractmethod
     def _start(self, prior: PosePrior) -> Any:
-        """Return the filter's state for a Gaussian prior of the pose."""
+        """Return the filter's first state for a Gaussian prior of the pose."""
 
     @abstractmethod
     def _predict(self, t: float) -> None:
@@ -176,14 +175,15 @@ class Filter(Timeline):
         """Return the data of the present state that :meth:`trajectory` needs, with an attribute ``t``, the time [s]."""
 
     def _seek(self, m: Any) -> Any:
-        """Return the first state, determined with the measurement ``m``, or None if the pose is still unknown."""
+        """Return the filter's first state if the measurement ``m`` determines the start pose, otherwise None."""
         return None
 
     def _estimate_at(self, t: float | None) -> PoseEstimate:
         return self._at(t)._estimate()
 
     def _at(self, t: float | None) -> Self:
-        """Return the filter, or a copy predicted to ``t`` [s] if ``t`` is later. The copy must not be changed."""
+        """Return this filter, or a copy predicted to ``t`` [s] if ``t`` is later than its time. Do not change the
+        copy."""
         if t is None or t <= self._t or self._state is None:
             return self
         self._ahead = None
@@ -195,8 +195,8 @@ class Filter(Timeline):
         return ahead
 
     def _anchor(self) -> None:
-        """Store the integrated odometry at the time of the start. Call this at the first measurement after the start,
-        when all odometry from before the start has arrived."""
+        """Store the integrated odometry at the time of the filter's start. Call this at the first measurement after the
+        start, when all odometry from before it has arrived."""
         if not self._moves:
             self._odometry, self._moves = self._motion.state(self._t), True
 
@@ -265,7 +265,7 @@ def at_ticks(ticks: Sequence[float], t: Array, poses: Array, body_covariances: A
 
 
 def twin(rng: np.random.Generator) -> np.random.Generator:
-    """Return a copy of a random generator, which will draw the same numbers. A deep copy takes four times as long."""
+    """Return a copy of the random generator ``rng``, which will draw the same numbers as ``rng``."""
     bits = type(rng.bit_generator)(0)
     bits.state = rng.bit_generator.state
     return np.random.Generator(bits)

@@ -77,8 +77,8 @@ def solve_whole(graph: Graph, start: Values, *, is_guess: bool) -> tuple[Array, 
     keyframes.
 
     The estimates of all other variables are written into the graph. Observations of points that are certainly false
-    matches are removed. ``start``: initial values of all variables. ``is_guess``: True to use graduated non-convexity,
-    because the initial values are rough. Raises RunFailedError if the measurements do not determine a variable.
+    matches are removed. ``start``: initial values of all variables. ``is_guess``: True if the initial values are rough,
+    to use graduated non-convexity. Raises RunFailedError if the measurements do not determine a variable.
     """
     graph.drop_astray(graph.keyframes.values(), start)
     problem, best = best_optimum(graph, start, WIDEST if is_guess else 1.0)
@@ -108,8 +108,8 @@ class AtTheEnd:
         self._guesses: Values = {}  # rough estimates of all variables except poses
 
     def begin(self, newest: Keyframe) -> None:
-        """Prepare for the keyframe ``newest``. Call this at the start of the graph, and whenever keyframes were removed
-        before ``newest`` was added."""
+        """Delete the initial values of removed variables, and store the estimate of the keyframe ``newest``. Call this
+        at the start of the graph, and whenever keyframes were removed before ``newest`` was added."""
         graph = self._graph
         graph.forget_landmarks(())
         self._guesses = {key: value for key, value in self._guesses.items() if key in graph.values}
@@ -129,7 +129,7 @@ class AtTheEnd:
         return self._guesses[key]
 
     def is_open(self, keyframe: int) -> bool:
-        """Return True if factors may still be added to the keyframe with this number."""
+        """Return True if factors may still be added to the keyframe with the index ``keyframe``."""
         return keyframe in self._graph.keyframes
 
     is_kept = is_open

@@ -121,14 +121,14 @@ class Smoother(Timeline):
             self._doubt(m)
 
     def _estimate_at(self, t: float | None) -> PoseEstimate:
-        """Return the newest keyframe's pose, predicted by odometry to the present time or, if later, to ``t`` [s]. With
-        the setting ``final_only``, this is a rough estimate with the status ``unlocalized``."""
+        """Return the pose predicted by odometry from the newest keyframe to the current time or, if later, to ``t``
+        [s]. With the setting ``final_only``, this is a rough estimate with the status ``unlocalized``."""
         at = self._t if t is None else max(t, self._t)
         pose, _, covariance = self._graph.moved(at)
         return PoseEstimate(at, pose, covariance, self._status(covariance))
 
     def _status(self, covariance: Array) -> Status:
-        """Return the status of a present estimate with this ``covariance`` (3, 3) of (x, y, heading)."""
+        """Return the status of an estimate with this ``covariance`` (3, 3) of (x, y, heading) at the current time."""
         if self._settings.final_only:
             return "unlocalized"
         doubted = self._behind or self._search.doubts or self._search.is_unsure(self._t, covariance)
@@ -144,8 +144,8 @@ class Smoother(Timeline):
         return estimates
 
     def _simple(self, ticks: Sequence[float]) -> int:
-        """Return the number of first ``ticks`` [s] that need only a prediction: no search is running, and no keyframe
-        is due."""
+        """Return how many of the first ``ticks`` [s] need only a prediction of the pose. The number is 0 while a search
+        is running, and no counted tick needs a new keyframe."""
         waits = self._begun == math.inf or self._behind or self._search.waits or not self._graph.is_anchored
         if waits or ticks[0] <= max(self._t, self._graph.newest.t):
             return 0
@@ -183,8 +183,8 @@ class Smoother(Timeline):
         return self.diagnostics if self._graph.prior is None else self._concluded().graph.diagnostics
 
     def forget(self, until: float) -> None:
-        """Delete the trajectory before the time ``until`` [s], except for the part in the window of the last ``lag``
-        seconds. If ``lag`` is not a number of seconds, nothing is deleted."""
+        """Delete the trajectory before the time ``until`` [s], but nothing in the window of the last ``lag`` seconds.
+        If the setting ``lag`` is "all", nothing is deleted."""
         if isinstance(self._backend, Incremental):
             self._backend.forget(min(until, self._taken_until - self._settings.max_delay))
 
@@ -232,8 +232,8 @@ class Smoother(Timeline):
             self._go_on(refuted, best)
 
     def _go_on(self, refuted: Refuted, best: PosePrior) -> None:
-        """Remove the keyframes since ``refuted.since``, when the estimated pose became wrong, and process their
-        measurements again, beginning at the pose ``best``."""
+        """Remove the keyframes since ``refuted.since``, the time when the estimated pose became wrong. Then process
+        their measurements again, beginning at the pose ``best``."""
         graph, since = self._graph, refuted.since
         first = graph.newest.index + 1  # the number of the first keyframe to remove
         while first > 1 and graph.keyframes[first - 1].t >= since and self._backend.is_open(first - 2):
@@ -270,11 +270,11 @@ class Smoother(Timeline):
 
     @property
     def _taken_until(self) -> float:
-        """The time [s] until which all measurements are processed."""
+        """The time [s] up to which all measurements are processed."""
         return min((m.t for m in self._behind), default=self._t)
 
     def _catch_up(self) -> None:
-        """Process some of the stored measurements again, at a fixed computing cost per call."""
+        """Process again some of the measurements that wait for it. The computing cost of a call is limited."""
         work = REPLAYED
         while self._behind and work > 0:
             m = self._behind.popleft()

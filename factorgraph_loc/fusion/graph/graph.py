@@ -59,14 +59,11 @@ Guess = tuple[Array, Array]  # a pose (3,) and its body-frame covariance (3, 3)
 
 @dataclass
 class Keyframe:
-    """A pose variable of the graph.
-
-    ``index``, ``key``: its number and its key. ``t`` [s]: its time. ``odometry``: the integrated odometry at ``t``.
-    ``from_previous``: the motion since the previous keyframe. ``factor``: the factor of this motion, None until it is
-    needed. ``is_elsewhere``: True if the robot was carried since the previous keyframe. ``nodes``: the factors of
-    measurements. ``causal``: the estimate while this keyframe was the newest. ``final``: the estimate when this
-    keyframe left the window.
-    """
+    """A pose variable of the graph. ``index``, ``key``: its index among the keyframes and its key in the graph. ``t``
+    [s]: its time. ``odometry``: the integrated odometry at ``t``. ``from_previous``: the motion since the previous
+    keyframe. ``factor``: the factor of this motion, None until it is needed. ``is_elsewhere``: True if the robot was
+    carried since the previous keyframe. ``nodes``: the factors of measurements. ``causal``: the estimate while this
+    keyframe was the newest. ``final``: the estimate when this keyframe left the window."""
 
     index: int
     t: float
@@ -84,7 +81,7 @@ class Keyframe:
 
 
 class TickAt(NamedTuple):
-    """A time ``t`` [s] at which the trajectory needs a pose. ``keyframe``: the number of the last keyframe before
+    """A time ``t`` [s] at which the trajectory needs a pose. ``keyframe``: the index of the last keyframe at or before
     ``t``. ``odometry``: the integrated odometry at ``t``."""
 
     t: float
@@ -100,7 +97,7 @@ class Addition:
     values: Values = field(default_factory=dict)
 
     def hang(self, keyframe: Keyframe, *nodes: Node) -> None:
-        """Add the factors ``nodes`` to this object and to the list of factors of ``keyframe``."""
+        """Add the factors ``nodes`` to this object, and to the factors of ``keyframe``."""
         keyframe.nodes += nodes
         self.nodes += nodes
 
@@ -115,13 +112,11 @@ def jumps(guess: Guess, pose: Array) -> bool:
 
 
 class Mapper:
-    """Adds observed points that the map lacks to the graph, as variables. This base class adds nothing.
-
-    ``sensor``: the name of the sensor, "" for none. ``fewest``: the minimum number of observations of a point in the
-    graph. ``horizon``: the number of recent keyframes that the mapper needs. ``rejected``: the message for rejected
-    observations. ``estimates``: True if points become variables. ``knows_scale``: False if only odometry determines the
-    scale of the points.
-    """
+    """Adds observed points that the map lacks to the graph, as variables. This base class adds nothing. ``sensor``: the
+    name of the sensor, "" for none. ``fewest``: the minimum number of observations of a point in the graph.
+    ``horizon``: how many of the last keyframes the mapper needs. ``rejected``: the message for rejected observations.
+    ``estimates``: True if points become variables. ``knows_scale``: False if only odometry determines the scale of the
+    points."""
 
     sensor: str = ""
     fewest: int = 0
@@ -135,12 +130,13 @@ class Mapper:
         return False
 
     def take(self, m: Any, keyframe: Keyframe, guess: Guess, graph: Graph, addition: Addition) -> Guess:
-        """Process a measurement at the newest keyframe, and add its factors and points to ``addition``. ``guess``: pose
-        and covariance of the keyframe. Returns pose and covariance, corrected by the measurement."""
+        """Process the measurement ``m`` at the newest ``keyframe``, and add its factors and points to ``addition``.
+        ``guess``: pose and covariance of the keyframe. Returns pose and covariance, corrected by the measurement."""
         return guess
 
     def is_astray(self, node: Node, values: Values) -> bool:
-        """Return True if ``node`` observes a point, and certainly is a false match given the estimates ``values``."""
+        """Return True if ``node`` is the observation of a point, and certainly a false match given the estimates
+        ``values``."""
         return False
 
     def point(self, node: Node) -> int | None:
@@ -155,8 +151,8 @@ class Mapper:
         """Discard all points except the points with the keys ``keys``."""
 
     def forget(self, first: Keyframe) -> Sequence[int]:
-        """Delete the data of keyframes before ``first``. Also delete points that have left the graph, if ``first`` and
-        later keyframes do not observe them. Returns the keys of the deleted points."""
+        """Delete the data of keyframes before ``first``. Also delete the points that were removed from the graph and
+        are not observed from ``first`` on, and return their keys."""
         return ()
 
     def learnt(self, values: Mapping[int, Array], covariances: Mapping[int, Array]) -> PointMap | None:
@@ -166,13 +162,11 @@ class Mapper:
 
 
 class Graph:
-    """A factor graph of a run. ``keyframes``: by number. ``values``, ``covariances``: of all other variables, by key.
-
-    ``newest``: the last keyframe, whose present estimate is ``pose`` (3,) with body-frame ``covariance`` (3, 3).
-    ``keys``: the keys of constants and landmarks by name. ``departed``: estimates and covariances of points that have
-    left the graph. ``t`` [s]: the newest time. The solver sets two functions: ``current(key)`` returns the present
-    estimate of a variable, and ``is_open(number)`` is True if a keyframe may still get factors.
-    """
+    """A factor graph of a run. ``keyframes``: by index. ``values``, ``covariances``: of all other variables, by key.
+    ``newest``: the last keyframe, with the current estimate ``pose`` (3,) and body-frame ``covariance`` (3, 3).
+    ``keys``: the keys of constants and landmarks by name. ``departed``: estimates and covariances of points that were
+    removed from the graph. ``t`` [s]: the newest time. The solver sets two functions. ``current(key)`` returns the
+    current estimate of a variable. ``is_open(index)`` is True if a keyframe may still get factors."""
 
     newest: Keyframe
     current: Callable[[int], Array]
@@ -222,14 +216,15 @@ class Graph:
         self.keyframes[keyframe.index] = self.newest = keyframe
 
     def cut(self, first: int, t: float) -> None:
-        """Remove keyframe ``first`` and all later ones. The trajectory is cut there or, if earlier, at ``t`` [s]."""
+        """Remove the keyframes from index ``first`` on. The trajectory ends there or, if earlier, at ``t`` [s]."""
         for index in range(first, self.newest.index + 1):
             del self.keyframes[index]
         self.newest = self.keyframes[first - 1]
         self.ticks = [tick for tick in self.ticks if tick.keyframe < first and tick.t < t]
 
     def forget(self, first: int) -> None:
-        """Delete the keyframes before number ``first``, the trajectory before it, and points not observed since it."""
+        """Delete the keyframes with an index below ``first``, the trajectory before ``first``, and points not observed
+        since."""
         for index in range(next(iter(self.keyframes)), first):
             del self.keyframes[index]
         self.ticks = [tick for tick in self.ticks if tick.keyframe >= first]
@@ -251,7 +246,7 @@ class Graph:
 
     def part_of_step(self, keyframe: Keyframe, t: float) -> Increment:
         """Return the motion from ``keyframe`` to the time ``t`` [s], which must lie between this keyframe and the next
-        one. The motion between them is interpolated along an arc in proportion to time."""
+        one. It is interpolated along the arc between them in proportion to time."""
         following = self.keyframes[keyframe.index + 1]
         assert following.from_previous is not None
         step, share = self.recalibrated(following.from_previous), (t - keyframe.t) / (following.t - keyframe.t)
@@ -273,7 +268,7 @@ class Graph:
         return self.motion.moved(start, times, self.pose, self.covariance, self.value(MOTION, NOTHING_KNOWN))
 
     def between(self, first: Keyframe, last: Keyframe) -> Increment:
-        """Return the motion between two keyframes by odometry, corrected with its estimated constants."""
+        """Return the motion from keyframe ``first`` to ``last`` by odometry, corrected with its estimated constants."""
         return self.recalibrated(self.motion.relative(first.odometry, last.odometry))
 
     @property
@@ -310,7 +305,8 @@ class Graph:
         return key
 
     def node(self, keyframe: Keyframe, term: Term, sensor: str) -> Node:
-        """Return a factor (``term``) of an observation at a keyframe as a node. ``sensor``: the sensor's name."""
+        """Return the factor ``term`` of an observation at ``keyframe`` as a node of the graph. ``sensor``: the sensor's
+        name."""
         keys = (keyframe.key, *map(self.keys.__getitem__, term.blocks))
         return Node(keys, term.factor, term.rows, sensor=sensor)
 
@@ -373,13 +369,15 @@ class Graph:
                 del self.keys[name], self.values[key], self.covariances[key]
 
     def report_damping(self, damping: float) -> None:
-        """Add an event to the diagnostics if ``damping``, used to compute covariances, is larger than ever before."""
+        """Add an event to the diagnostics if ``damping``, a prior that was needed to compute covariances, is the
+        largest so far."""
         if damping > self._damping:
             self._damping = damping
             self.diagnostics.event(self.t, "damped", DAMPED, damping=damping)
 
     def unsolved(self, error: Exception) -> RunFailedError:
-        """Return an error with the message that the graph cannot be solved. ``error``: the solver's exception."""
+        """Return an error with the message that the graph cannot be solved, and why. ``error``: the solver's
+        exception."""
         return RunFailedError(f"the graph cannot be solved at {self.t:.3f} s: {self.reason(error)}")
 
     def reason(self, error: Exception) -> str:

@@ -65,8 +65,8 @@ class Incremental:
         self._oldest = 0  # the number of the oldest keyframe that has not left the window
 
     def forget(self, until: float) -> None:
-        """Delete the keyframes before the time ``until`` [s] that have left the window. If all keyframes are optimised
-        together at the end of the run, nothing is deleted."""
+        """Delete the keyframes before the time ``until`` [s] that are no longer in the window. Nothing is deleted if
+        all keyframes are optimised together at the end of the run."""
         graph = self._graph
         if self._is_whole or not graph.keyframes or until < next(iter(graph.keyframes.values())).t:
             return
@@ -75,11 +75,11 @@ class Incremental:
         graph.forget(min(last, self._solver.oldest))  # a rebuilt solver needs the rest
 
     def final(self, graph: Graph) -> tuple[Array, Array]:
-        """Return the final poses (M, 3) and covariances (M, 3, 3) of the keyframes of ``graph``, a copy of the graph.
+        """Return the final poses (M, 3) and body-frame covariances (M, 3, 3) of the keyframes of ``graph``, a copy of
+        the graph.
 
-        Covariances are in the body frame. If the setting ``lag`` is not a number of seconds, all poses are optimised
-        together. Otherwise poses in the window have their present estimates. Older poses have the estimates from when
-        they left the window.
+        If the setting ``lag`` is "all", all poses are optimised together. Otherwise poses in the window have their
+        current estimates, and older poses the estimates from when they left the window.
         """
         if self._settings.smooth and self._is_whole:
             return solve_whole(graph, self._newest_values(graph), is_guess=self._settings.final_only)
@@ -101,7 +101,7 @@ class Incremental:
         return np.array([p for p, _ in known]), np.array([c for _, c in known])
 
     def _newest_values(self, graph: Graph) -> Values:
-        """Return the present estimates of all variables of ``graph``, a copy of the graph."""
+        """Return the current estimates of all variables of ``graph``, a copy of the run's graph, by key."""
         known = self._waiting.values | {k.key: k.final[0] for k in graph.keyframes.values() if k.final is not None}
         keys = [*(k.key for k in graph.keyframes.values()), *graph.values]
         return known | {key: self._solver.value(key) for key in keys if key not in known}
@@ -138,8 +138,8 @@ class Incremental:
         self._wait(addition, guess)
 
     def _wait(self, addition: Addition, guess: Guess) -> None:
-        """Store the factors and variables of ``addition`` for the next update of the solver. Until then the newest
-        estimate is ``guess``, a pose and its covariance."""
+        """Store the factors and variables of ``addition`` for the next update of the solver. Until then the estimate of
+        the newest pose is ``guess``, with its covariance."""
         self._waiting.nodes += addition.nodes
         self._waiting.values |= addition.values
         self._graph.pose, self._graph.covariance = guess
@@ -149,11 +149,12 @@ class Incremental:
         return self._solver.value(key)
 
     def is_open(self, keyframe: int) -> bool:
-        """Return True if factors may still be added to the keyframe with this number, because it is in the window."""
+        """Return True if factors may still be added to the keyframe with the index ``keyframe``, because it is in the
+        window."""
         return keyframe >= self._oldest and keyframe in self._graph.keyframes
 
     def is_kept(self, keyframe: int) -> bool:
-        """Return True if the final optimisation includes the keyframe with this number."""
+        """Return True if the final optimisation includes the keyframe with the index ``keyframe``."""
         return self._is_whole or self.is_open(keyframe)
 
     def _update(self, addition: Addition) -> None:
@@ -179,12 +180,9 @@ class Incremental:
             self._graph.diagnostics.reject(f"factor: {self._failed.pop()}")
 
     def _read(self, newest: Keyframe, touched: Iterable[int]) -> None:
-        """Copy estimates from the solver after an update: the newest pose, and the variables ``touched`` (keys) by the
-        update.
-
-        Covariances take time. They are read only for the pose, landmarks, and constants whose covariance a sensor
-        needs.
-        """
+        """Copy estimates from the solver after an update: the newest pose, and the other variables with keys in
+        ``touched``. Covariances are costly. They are copied only for the pose, for landmarks, and for constants if a
+        sensor needs them."""
         graph = self._graph
         newest.causal = graph.pose, graph.covariance = self._marginal(newest.key)
         for key in touched:
@@ -204,8 +202,8 @@ class Incremental:
 
     def _marginal(self, key: int, known: Array | None = None, graph: Graph | None = None) -> Guess:
         """Return the estimate and covariance of the variable ``key``. ``known``: the covariance if it is already
-        computed. ``graph``: the graph whose diagnostics get a report if the covariance needed damping, by default the
-        graph of the run."""
+        computed. ``graph``: the diagnostics of this graph get an event if the covariance needed damping. None means the
+        run's graph."""
         value = self._value(key)
         try:
             covariance = self._solver.covariance(key) if known is None else known
@@ -220,11 +218,9 @@ class Incremental:
         return value, positive.sound(covariance)
 
     def _leave(self, window: Window, now: float, new: Collection[int]) -> None:
-        """Store the final estimates of keyframes that are older than the lag, before the next update marginalises them.
-
-        ``window``: the solver. ``now`` [s]: the time of the newest keyframe. ``new``: keys of variables that are not
-        yet in the solver. The estimates of all constants and landmarks in the solver are stored too.
-        """
+        """Store the final estimates of keyframes that are older than the lag, because the next update marginalises
+        them. Also store the estimates of all constants and landmarks in the solver. ``window``: the solver. ``now``
+        [s]: the time of the newest keyframe. ``new``: keys of variables that are not yet in the solver."""
         assert self._lag is not None
         graph, oldest = self._graph, self._graph.keyframes[self._oldest]
         # keyframes leave one update after their estimates are stored, because both in one update would take longer
@@ -258,7 +254,7 @@ class Incremental:
         self._forget(points, marginals)
 
     def _forget(self, points: Iterable[int], marginals: Mapping[int, Array]) -> None:
-        """Store the estimates and covariances of points that leave the window, and remove the points from the graph.
+        """Remove the ``points`` (keys) that leave the window from the graph, and store their estimates and covariances.
         ``marginals``: covariances that are already computed, by key."""
         for key in points:
             try:
@@ -271,8 +267,8 @@ class Incremental:
     def _start_again(self, newest: Keyframe, summary: MarginalSummary | None, *, failed: bool = False) -> None:
         """Build a new solver from the graph. ``newest``: the last keyframe.
 
-        ``summary``: the marginal factors of variables that have left the window. The new solver gets these, and all
-        measurements that they do not contain. If it is None, the solver gets the priors and all measurements.
+        ``summary``: marginal factors that replace the variables no longer in the window. The new solver gets these, and
+        all measurements that they do not contain. If it is None, the solver gets the priors and all measurements.
         ``failed``: True if the previous solver failed. Raises RunFailedError if the new solver fails.
         """
         graph, first = self._graph, 0 if summary is None else summary.oldest
@@ -305,8 +301,8 @@ class Incremental:
         return [start, *(gtsam.PriorFactorVector(key, mean, gaussian(covariances[key])) for key, mean in means.items())]
 
     def _stamps(self, keyframes: Sequence[Keyframe], values: Values) -> dict[int, float]:
-        """Return the time [s] of each variable of a new window, by key. A variable leaves the window when it is older
-        than the lag. Points get the time of the newest keyframe."""
+        """Return {key: time [s]} of the variables ``values`` of a new window. A variable leaves the window when its
+        time is older than the lag. Points get the time of the last of ``keyframes``."""
         now = keyframes[-1].t
         oldest = -math.inf if self._lag is None else now - self._lag - self._margin
         stamps = {key: now if key in self._graph.values else oldest for key in values}
@@ -325,8 +321,8 @@ class Incremental:
         return Node((previous, keyframe.key), native=native)
 
     def _new_solver(self, *, failed: bool = False) -> FullHistory | Window:
-        """Return a new solver without factors. ``failed``: True if the previous solver failed. A slower factorisation
-        is then used."""
+        """Return a new solver without factors. ``failed``: True if the previous solver failed. The new one then uses a
+        slower but more robust factorisation."""
         parameters = gtsam.ISAM2Params()
         # Cholesky fails in long dead reckoning, but is twice as fast as QR if there are points
         parameters.setFactorization("CHOLESKY" if self._maps and not failed else "QR")

@@ -96,12 +96,12 @@ class Builder:
         self._gatherer: Sensor | None = None  # the sensor of the collected observations
 
     def is_due(self, t: float) -> bool:
-        """Return True if a new keyframe is needed at ``t`` [s], because the last keyframe is old."""
+        """Return True if the last keyframe is so old at ``t`` [s] that a new one is needed."""
         return t - self._graph.newest.t >= LONGEST_INTERVAL
 
     def pass_time(self, odometry: ChainState) -> None:
-        """Process a time at which the run records the pose. ``odometry``: the integrated odometry at this time, with
-        the time."""
+        """Process a time at which the run records the pose. ``odometry``: the integrated odometry at this time; its
+        field ``t`` is the time."""
         graph, t = self._graph, odometry.t
         graph.t = max(graph.t, t)
         if self.is_due(t):
@@ -109,8 +109,8 @@ class Builder:
         graph.ticks.append(TickAt(t, graph.keyframe_before(t).index, odometry))
 
     def take(self, m: Measurement, odometry: ChainState) -> bool:
-        """Convert a measurement to factors of the graph. ``odometry``: the integrated odometry at its time. Returns
-        False if it is ignored, because its keyframe is no longer in the solver."""
+        """Convert the measurement ``m`` to factors of the graph. ``odometry``: the integrated odometry at its time.
+        Returns False if the measurement is ignored, because its keyframe is no longer in the solver."""
         graph, sensor = self._graph, self._graph.sensors[m.source]
         graph.t = max(graph.t, m.t)
         if self._needs_keyframe(m, sensor):
@@ -161,9 +161,9 @@ class Builder:
     def _gather_from(
         self, sensor: Sensor, m: Measurement, odometry: ChainState, offset: Increment | None, guess: Guess
     ) -> None:
-        """Correct the newest pose by a measurement of a sensor whose observations are collected until :meth:`gather`.
-        ``odometry``: the integrated odometry at its time. ``offset``: the motion from the newest pose to this time, or
-        None. ``guess``: the newest pose and its covariance."""
+        """Correct the newest pose by the measurement ``m``. Its observations are collected until :meth:`gather`.
+        ``odometry``: the integrated odometry at its time. ``offset``: the motion from the newest keyframe to this time,
+        or None. ``guess``: the newest pose and its covariance."""
         graph = self._graph
         if self._gatherer is not sensor:
             nodes = self.gather()
@@ -212,7 +212,8 @@ class Builder:
         return applied
 
     def _add_keyframe(self, odometry: ChainState, m: Measurement | None) -> None:
-        """Add a keyframe at the time of ``odometry``. ``m``: a measurement at this time to process on it, or None."""
+        """Add a keyframe at the time of ``odometry``. ``m``: a measurement of this time, which becomes factors of the
+        keyframe, or None."""
         graph, newest, t = self._graph, self._graph.newest, odometry.t
         keyframe = Keyframe(newest.index + 1, t, *graph.motion.travelled(newest.odometry, t))
         pose, covariance, _ = graph.moved(t)
@@ -252,8 +253,9 @@ class Builder:
         return guess
 
     def _add_link(self, link: Link, sensor: Sensor, keyframe: Keyframe, addition: Addition) -> None:
-        """Add a factor between two poses (such as a loop closure) to ``addition``. ``link``: the factor and the time of
-        the earlier pose. If that pose is no longer in the solver, only the final optimisation uses the factor."""
+        """Add to ``addition`` a factor between the pose of ``keyframe`` and an earlier pose (such as a loop closure).
+        ``link``: the factor and the time of the earlier pose. If that pose is no longer in the solver, only the final
+        optimisation uses the factor."""
         earlier = self._graph.keyframe_before(link.earlier)
         node = Node((keyframe.key, earlier.key), link.factor, link.rows, sensor=sensor.name)
         keyframe.nodes.append(node)
@@ -261,8 +263,9 @@ class Builder:
             addition.nodes.append(node)
 
     def _add_block(self, new: NewVariable, sensor: Sensor, view: _KeyframeView, addition: Addition) -> None:
-        """Add the landmark ``new``, and factors of its earlier observations by ``sensor``, to ``addition``. If most of
-        the observing poses have left the graph, the landmark gets a prior instead. ``view``: the observing keyframe."""
+        """Add to ``addition`` the landmark ``new``, and factors of its earlier observations by ``sensor``. If most of
+        the observing poses are no longer in the solver, the landmark gets a prior instead. ``view``: the observing
+        keyframe."""
         graph = self._graph
         key = graph.new_block(new, view.covariance)
         addition.values[key] = new.mean
