@@ -96,10 +96,8 @@ def _map_warnings(trials: Sequence[Trial]) -> list[Notice]:
 
 
 def check(logs: Sequence[Log], *, blind: bool = False) -> None:
-    """Raise InputError if ``logs`` cannot be calibrated together.
-
-    The logs must have odometry, measurements, equal sensors and, unless ``blind`` is True, a reference trajectory.
-    """
+    """Raise InputError if ``logs`` cannot be calibrated together. The logs must have odometry, measurements, equal
+    sensors and, unless ``blind`` is True, a reference trajectory."""
     if not logs:
         raise InputError("there is no log to calibrate from")
     for log in logs:

@@ -62,10 +62,8 @@ class Trial:
 
 
 def folds_of(logs: Sequence[Log]) -> list[tuple[list[Log], list[Log]]]:
-    """Return the folds of a cross-validation, as pairs of the logs to learn from and the held-out sections.
-
-    Each recording is held out once. The two halves of a single recording count as two recordings.
-    """
+    """Return the folds of a cross-validation, as pairs of the logs to learn from and the held-out sections. Each
+    recording is held out once. If all logs are of one recording, its two halves are the two recordings."""
     parts = list(zip(recordings(logs), logs, strict=True))
     if len({number for number, _ in parts}) == 1:
         halves = [(half, _section(log, half / 2, (half + 1) / 2)) for half in range(2) for log in logs]
@@ -126,17 +124,15 @@ def _is_known(trial: Trial, key: str) -> bool:
 
 
 def growth(trials: Sequence[Trial]) -> float:
-    """Return the ratio of the position RMSE on held-out sections with the learnt rig to that with the input rig.
-
-    It is the geometric mean over the estimators and over causal and final trajectories. Returns NaN if no section has
-    an RMSE with both rigs.
-    """
+    """Return the ratio of the position RMSE on held-out sections with the learnt rig to that with the input rig. It is
+    the geometric mean over the estimators and over causal and final trajectories. Returns NaN if no section has an RMSE
+    with both rigs."""
     return _ratio(trials, lambda mine, rig, kind: pooled(mine, rig, f"{kind}.position_rmse"))
 
 
 def _ratio(trials: Sequence[Trial], loss: Callable[[Sequence[Trial], str, str], float]) -> float:
-    """Return the ratio of a loss with the learnt rig to that with the input rig. Returns NaN if no trial has scores of
-    both.
+    """Return the ratio of a loss with the learnt rig to that with the input rig. Returns NaN if no trial has both
+    scores.
 
     ``loss``: a function (trials, rig, kind) that returns a number, where kind is "causal" or "final". The ratio is the
     geometric mean over the estimators and over causal and final trajectories.

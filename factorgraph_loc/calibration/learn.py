@@ -146,11 +146,8 @@ def learn_by_turns(
 
 
 def _smoothed(log: Log, smooth: Smooth) -> Traced:
-    """Return a log with the trajectory of the smoother as reference. ``smooth``: a function that runs the smoother on a
-    log.
-
-    Raises InputError if the robot is not localized, or if the median position sigma exceeds :data:`TOO_VAGUE`.
-    """
+    """Return a log with the smoothed trajectory as reference. ``smooth``: a function that runs the smoother on a log.
+    Raises InputError if the robot is not localized, or if the median position sigma exceeds :data:`TOO_VAGUE`."""
     result = smooth(log)
     final = result.final
     if result.first_localized() is None or len(final) < 2 or final.covariances is None:

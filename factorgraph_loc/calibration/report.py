@@ -28,12 +28,9 @@ VIEW = 5.0  # standard deviations; larger residuals are drawn at the edge
 
 
 def constants_table(constants: Sequence[FittedConstant], logs: Sequence[str] = ()) -> Rows:
-    """Return a table of constants: initial value, learnt value with standard deviation, prior. The table is a tuple of
-    the header and the list of rows.
-
-    ``logs``: names of the logs. If there are any, the table also has the values that are learnt from each log
-    separately.
-    """
+    """Return a table of constants, as header and list of rows: initial value, learnt value with standard deviation,
+    prior. ``logs``: names of the logs. If there are any, the table also has the values that are learnt from each log
+    separately."""
     header = ("constant", "input rig", "learnt", "standard deviation", "prior", "", *logs)
     rows = []
     for c in constants:
@@ -44,8 +41,8 @@ def constants_table(constants: Sequence[FittedConstant], logs: Sequence[str] = (
 
 
 def accuracy_table(calibration: Calibration) -> Rows:
-    """Return a table of errors with the input rig and a learnt rig, on each held-out log and on all. The table is a
-    tuple of the header and the list of rows. For each held-out log, the rig is learnt from the other logs."""
+    """Return a table of errors, as header and list of rows. The errors are those with the input rig and a learnt rig,
+    on each held-out log and on all. For each held-out log, the rig is learnt from the other logs."""
     header = ("held-out log", "estimator", "rig", *(f"{kind} {name}" for kind in KINDS for name in FIGURES))
     rows = []
     logs = dict.fromkeys(t.log for t in calibration.trials)

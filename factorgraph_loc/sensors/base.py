@@ -273,8 +273,9 @@ class Sensor:
         raise NotImplementedError
 
     def judge(self, observation: Any, correction: Correction, view: View) -> bool:
-        """Return False if the estimator must reject ``observation``, otherwise True. Also record its innovation.
-        ``correction``: the result of :meth:`Observation.correct`. ``view``: the estimate before the correction."""
+        """Return False if the estimator must reject ``observation``, otherwise True. Also record its innovation in the
+        diagnostics. ``correction``: the result of :meth:`Observation.correct`. ``view``: the estimate before the
+        correction."""
         return True
 
     def evidence(self, m: Any) -> Observation | None:

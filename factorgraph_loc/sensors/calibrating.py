@@ -118,9 +118,7 @@ class Calibrator:
 
 class OneOfSeveral(Calibrator):
     """The calibration of one sensor of a rig with several sensors of its type. The other sensors are ignored.
-
-    ``calibrator``: the calibration of this type of sensor. ``name``: the name of the sensor in the rig.
-    """
+    ``calibrator``: the calibration of this type of sensor. ``name``: the name of the sensor in the rig."""
 
     def __init__(self, calibrator: Calibrator, name: str) -> None:
         self._calibrator = calibrator
@@ -130,7 +128,8 @@ class OneOfSeveral(Calibrator):
     def learn(
         self, traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path | None, like: SensorKnowledge | None = None
     ) -> SensorKnowledge:
-        """Return the sensor's constants and noise. For the arguments see :meth:`Calibrator.learn`."""
+        """Return the sensor's constants and noise, estimated from the logs ``traced``. ``rig``: the rig with initial
+        values. Other arguments: see :meth:`Calibrator.learn`."""
         kind, name = self._calibrator.section, self.section
         alone = [
             replace(
@@ -184,7 +183,8 @@ class ConstantsCalibrator(Calibrator):
     def learn(
         self, traced: Sequence[Traced], rig: Rig, first: Rig, _grids: Path | None, _like: SensorKnowledge | None = None
     ) -> SensorKnowledge:
-        """Return the sensor's constants and noise, estimated by least squares. See :meth:`Calibrator.learn`."""
+        """Return the sensor's constants and noise, estimated by least squares from the logs ``traced``. ``rig``: the
+        rig with initial values. Other arguments: see :meth:`Calibrator.learn`."""
         if self.channel not in traced[0].log.streams:
             return SensorKnowledge()
         if traced[0].constants is not None:
@@ -249,8 +249,9 @@ class ConstantsCalibrator(Calibrator):
         return out
 
     def _pooled(self, traced: Sequence[Traced], rig: Rig, first: Rig) -> SensorKnowledge:
-        """Return the result for logs with smoothed trajectories. Each constant is the mean of the estimates of the
-        smoother over the logs. ``first``: see :meth:`Calibrator.learn`."""
+        """Return the result for the logs ``traced`` with smoothed trajectories. Each constant is the mean of the
+        smoother's estimates over the logs. ``first``: the rig before the first iteration of smoothing and
+        calibration."""
         if not hasattr(rig.section(self.section), "uncertainty"):
             return SensorKnowledge()
         prefix = f"{self.channel}." if self.senses else ""

@@ -120,11 +120,11 @@ class Summary:
 
 
 def line(name: str, shift: float, than: str, setting: str, offset: float) -> Notice:
-    """Return a warning that the timestamps of the stream ``name`` are ``shift`` [s] later than those of ``than``.
+    """Return a warning that the timestamps of the stream ``name`` differ from those of another stream, named ``than``.
 
-    A negative ``shift`` means earlier. The warning proposes to set ``time_offset`` to ``offset`` [s] in the section
-    ``setting`` of the rig. If ``shift`` is the largest that was tried, it proposes to correct ``clock_offset`` in the
-    manifest.
+    ``shift``: how much later [s] the timestamps are, negative if they are earlier. The warning proposes to set
+    ``time_offset`` to ``offset`` [s] in the section ``setting`` of the rig. If ``shift`` is the largest that was tried,
+    it proposes to correct ``clock_offset`` in the manifest.
     """
     if abs(shift) > FARTHEST - STEP:
         sentence = (
@@ -184,7 +184,7 @@ class Ride:
 
     ``settings``: settings of the simulation. ``rig``: the rig that estimators will use. ``world``: the true world.
     ``truth``: the true trajectory, from t = 0. ``rng(name)``: returns a random generator, seeded by log and ``name``.
-    ``rng_of_world(name)``: the same, seeded by the world.
+    ``rng_of_world(name)``: returns a random generator, seeded by world and ``name``.
     """
 
     settings: Any

@@ -77,8 +77,8 @@ class KnownPosition:
     def loss(self, poses: Array, now: ChainState, noise: Array | None = None) -> Array:
         """Return half the squared Mahalanobis distances (N,) of N start positions from the known start position.
 
-        The start positions follow from the odometry and from ``poses`` (N, 3) at the odometry state ``now``. ``noise``
-        (3, 3): an additional body-frame covariance of the poses.
+        The start positions are computed from ``poses`` (N, 3) at the odometry state ``now`` and from the odometry.
+        ``noise`` (3, 3): an additional body-frame covariance of the poses.
         """
         error, _, covariance = self._linearized(poses, now, noise)
         return np.asarray(0.5 * np.einsum("ni,ni->n", error, positive.solve(covariance, error[..., None])[..., 0]))
@@ -91,8 +91,9 @@ class KnownPosition:
         return np.asarray(-self.loss(poses, now) - normaliser)
 
     def normal_equations(self, poses: Array, now: ChainState, noise: Array | None = None) -> tuple[Array, Array]:
-        """Return the Gauss-Newton Hessian (N, 3, 3) and the gradient (N, 3) of :meth:`loss`, both by body-frame
-        perturbations of ``poses`` (N, 3). The arguments are those of :meth:`loss`."""
+        """Return the Gauss-Newton Hessian (N, 3, 3) and the gradient (N, 3) of :meth:`loss`, by perturbations of
+        ``poses`` (N, 3) in the body frame. ``now``: the odometry state at the poses. ``noise`` (3, 3): an additional
+        covariance of the poses."""
         error, jacobian, covariance = self._linearized(poses, now, noise)
         weighted = positive.solve(covariance, jacobian).transpose(0, 2, 1)
         return weighted @ jacobian, (weighted @ error[..., None])[..., 0]

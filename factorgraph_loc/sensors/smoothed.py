@@ -86,7 +86,8 @@ def corrections_of(name: str, traced: Sequence[Traced]) -> list[tuple[float, flo
 def pooled_constants(
     section: str, prefix: str, settings: Any, first: Any, traced: Sequence[Traced]
 ) -> tuple[Any, list[FittedConstant]]:
-    """Return the settings of a section with updated constants, and a list of the constants that changed.
+    """Return the settings of the ``section`` of a sensor with updated constants, and a list of the constants that
+    changed.
 
     Constants that were estimated in all logs get the mean of the estimates. With several logs, their uncertainties are
     updated too. ``prefix``: the prefix of the constants' names in ``Traced.constants``. ``settings``: the settings with

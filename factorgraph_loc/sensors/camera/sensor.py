@@ -279,9 +279,9 @@ class PixelFinder:
     def refuted_since(self, m: Pixels, odometry: ChainState, pose: Array, covariance: Array) -> float | None:
         """Return the time [s] since which the estimated pose has been wrong, or None if the estimate may be right.
 
-        Call this after an estimator has processed the image ``m``. ``pose`` (3,): the estimate at the state
-        ``odometry``. It is wrong if points of the map are missing in the last images, and if these images agree on
-        another pose.
+        Call this after an estimator has processed the image ``m``. ``odometry``: the odometry state at the image.
+        ``pose`` (3,): the estimate at the image. It is wrong if points of the map are missing in the last images, and
+        if these images agree on another pose. ``covariance`` is ignored.
         """
         self._stamps = [s for s in self._stamps if s[0] < m.t]
         self._stamps.append((m.t, self._points.missed))
@@ -296,8 +296,8 @@ class PixelFinder:
         return since if self._agree() else None
 
     def look(self, m: Pixels, odometry: ChainState) -> bool:
-        """Compute the robot's pose from ``m``. ``odometry``: the odometry state at the image. Returns False if no pose
-        fits."""
+        """Return True if a pose of the robot fits the image ``m``, and store it for ``hypotheses`` and ``best``.
+        ``odometry``: the odometry state at the image."""
         if not self._fixes and m.t < self._fruitless + SEARCH_INTERVAL and m.t >= self._fruitless:
             return False
         self._fixes = [f for f in self._fixes if m.t - KEPT <= f.odometry.t < m.t]

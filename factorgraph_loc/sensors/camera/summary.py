@@ -130,10 +130,8 @@ def summarize_pixels(log: Log) -> PixelSummary | None:
 
 
 def camera_problems(log: Log, images: ImageSummary | None, pixels: PixelSummary | None) -> list[Notice]:
-    """Return warnings about the images and named points of a log, such as unreadable images.
-
-    ``images``, ``pixels``: the results of :func:`summarize_images` and :func:`summarize_pixels`.
-    """
+    """Return warnings about the images and named points of a log, such as unreadable images. ``images``, ``pixels``:
+    the results of :func:`summarize_images` and :func:`summarize_pixels`."""
     out = list[Notice]()
     if log.rig.find(CameraSettings) is None:
         streams = [name for name, summary in (("images", images), ("named points", pixels)) if summary is not None]

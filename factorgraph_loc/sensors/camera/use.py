@@ -91,9 +91,8 @@ class PreparedLog:
 
 def frontend_of(rig: Rig, world: World) -> FrontendSettings:
     """Return the settings of feature detection in ``rig``, with the kind of feature of the points in the map ``world``.
-
-    If the map has no points, features are distributed over the image, because the strongest may be on a moving object.
-    """
+    If the map has no points, features are distributed over the image, because the strongest may be on a moving
+    object."""
     camera = rig.find(CameraSettings)
     settings = FrontendSettings() if camera is None else camera.frontend
     if world.points is None or not world.points.feature:

@@ -70,8 +70,8 @@ class Sightings:
         return bearing_range.residuals(settings.model(), poses, self.points, self.ranges, self.bearings)
 
     def residuals(self, settings: BearingRangeSettings, moved: Array | float = 0.0) -> Array:
-        """Return :meth:`whitened` residuals (K, 2), multiplied by the square root of the inlier probabilities
-        ``sound``."""
+        """Return the residuals (K, 2) of :meth:`whitened`, multiplied by the square root of the inlier probabilities
+        ``sound``. ``settings``: the sensor model. ``moved`` (3,): a body-frame perturbation of all reference poses."""
         return np.sqrt(self.sound) * self.whitened(settings, moved)
 
     def errors(self, settings: BearingRangeSettings) -> Array:
@@ -112,10 +112,11 @@ def separated(errors: Array, ranges: Array) -> tuple[tuple[float, float], Array]
 
 
 def _scatter(errors: Array, ranges: Array, weights: Array, start: tuple[float, float]) -> tuple[float, float]:
-    """Return the standard deviation of ``errors`` (K,) with ``weights`` (K,) as the pair (constant, relative).
+    """Return the standard deviation of ``errors`` (K,) with ``weights`` (K,) as the pair (constant, relative). At range
+    r it is sqrt(constant^2 + (relative r)^2). ``ranges`` (K,): measured ranges [m].
 
-    See :func:`separated`. This is one step of Fisher scoring from ``start``, the values of the previous step (Nelder
-    and Pregibon, "An extended quasi-likelihood function", Biometrika 74(2), 1987).
+    This is one step of Fisher scoring from ``start``, the pair of the previous step (Nelder and Pregibon, "An extended
+    quasi-likelihood function", Biometrika 74(2), 1987).
     """
     design = np.column_stack((np.ones(len(errors)), ranges**2))
     root = np.sqrt(weights) / (design @ np.square(start))

@@ -116,10 +116,8 @@ class Candidate:
 
 
 class _PathSightings:
-    """Locates one landmark from K sightings along a path. The odometry gives the path.
-
-    All positions and poses are in the robot frame at the last sighting.
-    """
+    """Locates one landmark from K sightings along a path, which the odometry measures. All positions and poses are in
+    the robot frame at the last sighting."""
 
     def __init__(
         self,

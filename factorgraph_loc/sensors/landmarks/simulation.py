@@ -58,9 +58,8 @@ def sighting_stream(
     z: float = 0.0,
 ) -> BearingRangeStream:
     """Return simulated sightings of all visible landmarks at ``times`` (N,) [s] from robot ``poses`` (N, 3).
-
-    ``settings``: maximum range, field of view, late ranges. ``z``: height of the sensor [m]. ``rng``: draws the noise.
-    """
+    ``settings``: maximum range, field of view, and fraction and excess of late (too long) ranges. ``z``: height of the
+    sensor [m]. ``rng``: draws the noise."""
     points, names = points_of(world.landmarks.values(), z), list(world.landmarks)
     n, k = in_sight(model, world, poses, settings)
     ranges, bearings = bearing_range.predict(model, poses[n], points[k])
@@ -147,8 +146,9 @@ class LandmarkForecast:
         return np.asarray((self.looks_per_metre * ways)[:, None, None] * out)
 
     def add_log_weights(self, poses: Array, metres: float, stops: Places, seed: np.uint64, out: Array32) -> None:
-        """Simulate sightings from particles, and add their log-likelihoods to ``out``. For the arguments see
-        :meth:`~factorgraph_loc.sensors.interfaces.Forecast.add_log_weights`."""
+        """Simulate sightings from the first J of M particles, and add their log-likelihoods for all particles to
+        ``out`` (J, M). ``poses`` (S, M, 3): the particles at S points of a path of length ``metres`` [m]. Other
+        arguments: see :meth:`~factorgraph_loc.sensors.interfaces.Forecast.add_log_weights`."""
         sightings, scans = metres * self.looks_per_metre / len(poses), len(out)
         points = self.world.positions()
         for s in range(len(poses)):

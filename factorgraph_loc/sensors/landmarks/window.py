@@ -153,8 +153,9 @@ class SightingWindow:
     def refined(
         self, poses: Array, whitener: Array, iterations: int, noise: Array | None = None
     ) -> tuple[Array, Array]:
-        """Return N poses (N, 3) that minimise :meth:`losses`, and their body-frame covariances (N, 3, 3). ``poses``
-        (N, 3): the initial values. The method is Levenberg-Marquardt. For other arguments see :meth:`losses`."""
+        """Return N poses (N, 3) that minimise :meth:`losses`, and their body-frame covariances (N, 3, 3). ``poses`` (N,
+        3): the initial values. ``iterations``: the maximum number of steps of Levenberg-Marquardt. ``whitener``,
+        ``noise``: see :meth:`losses`."""
 
         def at(poses: Array, _: Integers) -> tuple[Array, Array, Array]:
             information, gradient = self._normal_equations(poses, whitener, noise)
@@ -170,9 +171,10 @@ class SightingWindow:
         """Return a pose (3,) and its body-frame covariance (3, 3) at the last sighting, with correlated odometry
         errors.
 
-        The method is Gauss-Newton from ``pose`` (3,). The path since the sightings is marginalised. Let e be the
-        residuals, whitened by the sensor noise, J their Jacobian by the path, and C the covariance of the path. The
-        covariance of e is R = I + J C J'. The residuals on the most likely path are R^-1 e.
+        The method is ``iterations`` steps of Gauss-Newton from ``pose`` (3,). The path since the sightings is
+        marginalised. Let e be the residuals, whitened by the sensor noise, J their Jacobian by the path, and C the
+        covariance of the path. The covariance of e is R = I + J C J'. The residuals on the most likely path are R^-1 e.
+        ``whitener``: the result of :meth:`whitener`, for the initial robust weights.
         """
         covariances = self._covariance
         if self._start is not None:  # the known start becomes the first row, without robust loss

@@ -265,11 +265,9 @@ class OdometryCalibrator(ConstantsCalibrator):
     def with_noise(
         self, parts: Sequence[Windows], settings: OdometrySettings
     ) -> tuple[Sequence[Windows], OdometrySettings]:
-        """Return the windows with new ``sigmas``, and the unchanged ``settings``.
-
-        The standard deviations are robust estimates from the errors, one for all windows in motion and one for all
-        windows at rest.
-        """
+        """Return ``parts``, the windows of each log, with new ``sigmas``, and the unchanged ``settings``. The standard
+        deviations are robust estimates from the errors, one for all windows in motion and one for all windows at
+        rest."""
         errors, moves = [], []
         for part in parts:
             start, end = part.states(part.model(settings))

@@ -219,7 +219,8 @@ class RfidForecast:
         return np.asarray((self.rounds_per_metre * ways)[:, None, None] * score)
 
     def add_log_weights(self, poses: Array, metres: float, stops: Places, seed: np.uint64, out: Array32) -> None:
-        """Simulate reads from particles, and add their log-likelihoods to ``out``. For the arguments see
+        """Simulate reads from the first J of M particles, and add their log-likelihoods for all particles to ``out``
+        (J, M). ``poses`` (S, M, 3): the particles at S points of a path of length ``metres`` [m]. Other arguments: see
         :meth:`~factorgraph_loc.sensors.interfaces.Forecast.add_log_weights`."""
         steps, total = len(poses), round(metres * self.rounds_per_metre)
         rounds = np.diff(np.arange(steps + 1) * total // steps).astype(np.int64)

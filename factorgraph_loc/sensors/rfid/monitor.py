@@ -198,12 +198,9 @@ KNOWN = BAND / 4.0  # m; maximum standard deviation of the position for a scan t
 
 @dataclass(frozen=True, eq=False)
 class ReadGroups:
-    """Sums of observed and predicted reads in G groups: one for each interval of the distance between antenna and tag,
-    then one for each of the ``antennas``.
-
-    ``sums`` (3, G): the number of observed reads, the number of predicted reads, and the variance of the former for
-    independent rounds.
-    """
+    """Sums of observed and predicted reads in G groups. There is one group for each interval of the distance between
+    antenna and tag. Then follows one group for each of the ``antennas``. ``sums`` (3, G): observed reads, predicted
+    reads, and the variance of observed reads if rounds are independent."""
 
     antennas: Sequence[str]
     sums: Array = field(init=False)

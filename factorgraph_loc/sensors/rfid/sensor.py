@@ -97,7 +97,8 @@ class TagObservation:
         columns: Mapping[str, slice],
         iterations: int = 1,
     ) -> Correction:
-        """Return the correction of a Gaussian estimate, by Fisher scoring. See :meth:`.Observation.correct`."""
+        """Return the correction of a Gaussian estimate of pose and blocks by this observation, computed by Fisher
+        scoring. For the arguments see :meth:`.Observation.correct`."""
         at, prior = [0, 1, 2], NO_VALUES
         for name in self.blocks:  # there is at most one block
             at, prior = [*at, *range(columns[name].start, columns[name].stop)], np.array(values[name])
@@ -294,8 +295,9 @@ class TagSensor(Sensor):
         return terms
 
     def at_end(self, factor: Factor, width: float) -> Factor | None:
-        """Return a copy of ``factor`` without the effect of tags that are clearly dead, weak or moved. Returns None for
-        phases if ``width`` is above 1, because their likelihood has local optima centimetres apart."""
+        """Return a copy of ``factor`` without the effect of tags that are clearly dead, weak or moved. ``width``: the
+        multiplier of the scale of robust losses. Returns None for phases if ``width`` is above 1, because their
+        likelihood has local optima centimetres apart."""
         factor = cast(RfidFactor, factor)
         if width > 1.0 and isinstance(factor.likelihood, PhaseLikelihood):
             return None

@@ -45,7 +45,7 @@ class AntennaSummary:
     """A summary of one antenna in a log.
 
     ``reads``, ``rounds``: the numbers of reads and of rounds. ``rate``: rounds per second. ``silent``: the number of
-    rounds without reads. ``last``: the timestamp [s] of the last round. ``last_read``: that of the last read, or None.
+    rounds without reads. ``last``: time [s] of the last round. ``last_read``: time [s] of the last read, or None.
     """
 
     reads: int

@@ -88,10 +88,8 @@ class ReadsByRound:
     antenna: list[str]
 
     def stream(self, t0_ns: int) -> RfidStream:
-        """Return the reads as a stream, in the order of the rounds. ``t0_ns``: the absolute time of t = 0 [ns].
-
-        A round without reads becomes a row without an EPC.
-        """
+        """Return the reads as a stream, in the order of the rounds. A round without reads becomes a row without an EPC.
+        ``t0_ns``: the absolute time of t = 0 [ns]."""
         silent = np.setdiff1d(np.arange(len(self.end_ns)), self.number)
         rounds = np.concatenate((self.number, silent))
         order = np.argsort(rounds, kind="stable")

@@ -37,8 +37,9 @@ class RfidCalibrator(Calibrator):
         self, traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path | None, like: SensorKnowledge | None = None
     ) -> SensorKnowledge:
         """Return the transform of surveyed tags to the world, the mounting of antennas, and the models of the read
-        probability. See :meth:`Calibrator.learn`. With smoothed trajectories, the transform is not estimated. Raises
-        InputError without antennas or for too short logs."""
+        probability. They are estimated from the logs ``traced``. ``rig``: the rig with initial values. With smoothed
+        trajectories, the transform is not estimated. Other arguments: see :meth:`Calibrator.learn`. Raises InputError
+        without antennas or for too short logs."""
         logs = [replace(trace.log, rig=rig) for trace in traced]
         if self.channel not in logs[0].streams or self.channel not in rig.sensors:
             return SensorKnowledge()

@@ -82,7 +82,8 @@ def _heights(pairs: TagPairs) -> list[float]:
 
 def design_of(grid: GridModel, points: Array, facing: Array) -> sparse.csr_array:
     """Return the sparse matrix (M, number of grid points) that interpolates the logits of ``grid`` at M tags.
-    ``points`` (M, 3): tag positions in the antenna frame [m]. ``facing`` (M,): see :class:`TagPairs`."""
+    ``points`` (M, 3): tag positions in the antenna frame [m]. ``facing`` (M,): cosine of the angle between the
+    direction of the tag's front and the direction to the antenna."""
     shape, heights = grid.logits.shape, grid.heights
     axes = [
         knots.linear((points[:, 2] - heights[0]) / (heights[1] - heights[0] if len(heights) > 1 else 1.0), shape[0]),
@@ -140,8 +141,8 @@ class Kind:
 
 def fit(pairs: TagPairs, kind: Kind, floor: Floor, antennas: int) -> tuple[tuple[DetectionModel, ...], tuple[int, ...]]:
     """Return detection models of a ``kind``, fitted to the reads and misses of ``pairs``, and the index of the model of
-    each antenna. An antenna without data gets a model that is fitted to all antennas. ``floor``: probabilities of false
-    reads and misses. ``antennas``: the number of antennas."""
+    each antenna. An antenna without data gets a model that is fitted to all antennas. ``floor``: minimum probabilities
+    of a read and of a miss. ``antennas``: the number of antennas."""
     if not kind.own:
         return (_fit_one(pairs, kind, floor),), (0,) * antennas
     active = [a for a in range(antennas) if np.any(pairs.antenna == a)]
@@ -179,8 +180,9 @@ def _fit_one(pairs: TagPairs, kind: Kind, floor: Floor) -> DetectionModel:
 
 
 def _held_out(pairs: TagPairs, kind: Kind, floor: Floor, antennas: int) -> float:
-    """Return the cross-validated negative log-likelihood per round of a ``kind`` of model: each fold of ``pairs`` is
-    predicted by models that are fitted to the other folds."""
+    """Return the cross-validated negative log-likelihood [nats per round] of a ``kind`` of model. Each fold of
+    ``pairs`` is predicted by models that are fitted to the other folds. ``floor``: see :func:`fit`. ``antennas``: the
+    number of antennas."""
     total = 0.0
     for fold in np.unique(pairs.fold):
         models, which = fit(pairs.part(pairs.fold != fold), kind, floor, antennas)

@@ -241,7 +241,8 @@ def _sampled_rounds(trace: Traced, settings: RfidSettings) -> Rounds:
 
 def _overdispersion(pairs: TagPairs, logit: Array, floor: Floor) -> tuple[float, float]:
     """Return the overdispersion of the reads in ``pairs`` and its standard error, see :func:`.overdispersion`.
-    ``logit`` (M,): predicted logits of the probability of a read."""
+    ``logit`` (M,): predicted logits of the probability of a read. ``floor``: minimum probabilities of a read and a
+    miss."""
     return overdispersion(pairs.hits, pairs.count, floor.probability(logit), pairs.antenna, pairs.tag, pairs.block)
 
 

@@ -132,8 +132,8 @@ class Floor:
 
 
 def terms(logit: Array, hits: Array, count: Array, floor: Floor) -> Terms:
-    """Return the binomial likelihood of ``hits`` (M,) reads in ``count`` (M,) rounds. ``logit`` (M,): logits of the
-    read probability by a detection model. ``floor``: probabilities of false reads and misses."""
+    """Return the binomial likelihood of ``hits`` (M,) reads in ``count`` (M,) rounds, with derivatives. ``logit`` (M,):
+    logits of the read probability by a detection model. ``floor``: minimum probabilities of a read and of a miss."""
     q = np.clip(floor.probability(logit), 1e-12, 1.0 - 1e-12)
     by_logit = (q - floor.false_read) * (1.0 - floor.miss - q) / (1.0 - floor.false_read - floor.miss)
     return Terms(

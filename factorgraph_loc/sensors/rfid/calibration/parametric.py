@@ -71,8 +71,9 @@ class Family:
 
 
 def features(points: Array, facing: Array) -> Array:
-    """Return the features (M, 11) in :data:`factors.rfid.model.FEATURES` of M tags. For the arguments see
-    :meth:`Family.jacobian`."""
+    """Return the features (M, 11) in :data:`factors.rfid.model.FEATURES` of M tags. ``points`` (M, 3): their positions
+    in the antenna frame [m]. ``facing`` (M,): cosine of the angle between the tag's front and the direction to the
+    antenna."""
     x, y, z = points.T
     r = np.sqrt(x**2 + y**2 + NEAR**2)
     w, c = 1.0 - x / r, facing
@@ -152,7 +153,7 @@ def geometry_parameters(
     and of the mounting of each antenna.
 
     The change of an antenna is a change that all antennas share, plus an own change if there are several antennas.
-    ``focus``: priors (mean, standard deviation) of changes by name, which replace the default priors.
+    ``focus``: priors (mean, standard deviation) of changes by name, such as "antennas.x", instead of the defaults.
     """
     priors = {name: (0.0, sigma) for name, sigma in (SURVEY | COMMON).items()} | dict(focus)
     antennas = settings.all_antennas()
@@ -189,8 +190,9 @@ def estimate_geometry(
     """Return maximum a posteriori estimates of the survey transform and of the mounting of the antennas.
 
     They are estimated together with a logistic model for all antennas. Returns ``settings`` and ``survey``, both
-    updated, and the posterior of the changes. ``floor``: probabilities of false reads and misses. ``focus``: see
-    :func:`geometry_parameters`. ``with_facing``: True if the model depends on the facing of tags.
+    updated, and the posterior of the changes. ``floor``: minimum probabilities of a read and of a miss. ``focus``:
+    priors of changes as in :func:`geometry_parameters`. ``with_facing``: True if the model depends on the facing of
+    tags.
     """
     count = max(len(nearby(log, settings, survey)) for log in logs)
     logs = [log.part(np.arange(len(log.t)) % (1 + count // MOST_PAIRS) == 0) for log in logs]

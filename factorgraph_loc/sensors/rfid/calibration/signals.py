@@ -80,7 +80,7 @@ def fit_phase(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings | 
 
 @dataclass(frozen=True)
 class _Focus:
-    """The agreement of phases along references as a function of a state (5,).
+    """The agreement of phases along references as a function of a state (5,): their mean resultant length, 0 to 1.
 
     The state is x, y, heading of the survey transform, and a correction of x, y of all antennas. ``reads``: the reads
     with a phase. ``model``: the model of phases. ``tags``: the tags in the survey frame. ``initial``: the initial
