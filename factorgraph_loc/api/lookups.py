@@ -42,8 +42,7 @@ class NamedSettings:
 
 @dataclass(frozen=True)
 class SensorDescription:
-    """A sensor. ``about``: its description. ``channels``: the names of such sensors that the option ``--sensors``
-    accepts.
+    """A sensor. ``about``: its description. ``channels``: the names of its measurements, for the option ``--sensors``.
 
     ``tables``: the columns of each table by its name. ``rig``: the settings of each section of the rig by its name.
     """
@@ -77,7 +76,8 @@ def known_sensors() -> list[SensorDescription]:
 
 
 def describe_sensor(name: str) -> SensorDescription:
-    """Return the description of a sensor. ``name``: its name, or a name in the option ``sensors``.
+    """Return the description of a sensor. ``name``: its name, such as "rfid", or a name of its measurements, such as
+    "rssi".
 
     Raises InputError if there is no such sensor.
     """

@@ -64,7 +64,7 @@ class StoredRun:
     events: tuple[tuple[float, str], ...]
 
     def played(self) -> Trajectory:
-        """Return the trajectory to animate: the causal one, or the final one if there are no causal estimates."""
+        """Return the trajectory to animate: causal estimates, or the final trajectory if there are no causal estimates."""
         return self.causal if len(self.causal) else self.final
 
 

@@ -51,7 +51,9 @@ def layers(log: Log) -> list[tuple[Marks, dict[str, Array], Lights]]:
 
 
 def ellipses(trajectory: Trajectory) -> tuple[Array, Array]:
-    """Return the times (K,) [s] of poses that have a covariance, and their 95 % ellipses as polygons (K, L, 2) [m]."""
+    """Return the times (K,) [s] of poses that have a covariance, and their 95 % ellipses (K, L, 2) [m].
+
+    An ellipse is a polygon with L corners."""
     if trajectory.covariances is None:
         return np.empty(0), np.empty((0, drawing_figures.CORNERS + 1, 2))
     covariances = trajectory.covariances[:, :2, :2]

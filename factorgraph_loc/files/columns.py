@@ -62,7 +62,7 @@ class Column:
 
     ``units``: the units that a file may use, with the factors that convert values to the first unit. ``low``, ``high``:
     inclusive bounds of converted values. ``may_lack``: whether a cell may be empty. ``doc``: meaning of the column.
-    ``field``: attribute of a ``Stream`` with the values of the column, "" if it has the name of the column.
+    ``field``: attribute of a ``Stream``, the measurements of a sensor, that has the values; "" if it is ``name``.
     ``left_out_below``: smaller values are treated as empty cells, with a warning.
     """
 

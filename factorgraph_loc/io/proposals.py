@@ -62,7 +62,7 @@ def proposal_of(
 
 
 def toml_of(content: Mapping[str, Any], name: str = "") -> str:
-    """Return settings as TOML: first the values, then the tables. Tables within these tables are written in braces.
+    """Return the settings ``content`` as TOML: first the values, then the tables. Tables within tables are in braces.
 
     With a ``name``, the settings are written as the table of that name.
     """

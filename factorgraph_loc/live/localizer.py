@@ -259,7 +259,7 @@ class Localizer:
             intake.require(m)
 
     def _is_under_way(self, t: float) -> bool:
-        """True if ``t`` [s] is finite and not before the start pose."""
+        """True if ``t`` [s] is finite and not before the time of the start pose."""
         return math.isfinite(t) and (self._prior is None or t >= self._prior.t)
 
     def _estimate(self, t: float | None) -> PoseEstimate:

@@ -215,8 +215,8 @@ def odometry(listeners: Listeners, options: OdometryTopic, static: StaticFrames)
 def _velocities(rows: TopicRows, warnings: list[Notice]) -> tuple[Integers, Array]:
     """Return the timestamps (N,) [ns] and the velocities (N, 2): forward [m/s] and turn rate [rad/s].
 
-    ``rows``: rows of two velocities, and optionally a quaternion and the variances of x and y. Null quaternions or
-    variances mean that the device had lost its pose. The timestamps and increments (M, 4) of
+    ``rows``: rows of two velocities, and optionally a quaternion and the variances of x and y. A zero quaternion or a
+    huge variance means that the device had lost its pose. The timestamps and increments (M, 4) of
     :func:`motions.bridge_losses` are then returned instead, and a warning is appended to ``warnings``."""
     values = rows.values
     null = np.zeros(len(rows), dtype=bool)

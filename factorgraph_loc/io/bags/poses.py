@@ -117,9 +117,9 @@ def path_of(rows: TopicRows, warnings: list[Notice], *, has_rotations: bool = Tr
     """Return the poses in ``rows``, the rows collected from a topic. Of rows with equal timestamps, the last is used.
 
     The columns are x, y, z [m], then the quaternion x, y, z, w, and optionally the variances of x and y.
-    ``has_rotations``: False if there is no quaternion. Null poses mean that the device had lost its pose. They are
-    skipped, and a warning is appended to ``warnings``. Raises InputError, with the number of the message, at an invalid
-    row.
+    ``has_rotations``: False if there is no quaternion. A zero quaternion or a huge variance means that the device had
+    lost its pose. Such rows are skipped, and a warning is appended to ``warnings``. Raises InputError, with the number
+    of the message, at an invalid row.
     """
     source, values = rows.source, rows.values
     if not has_rotations:

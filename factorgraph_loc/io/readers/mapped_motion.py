@@ -135,8 +135,8 @@ def read_reference(folder: TableFolder, options: ReferenceFile, t0_ns: int) -> T
 def _with_poses(mapped: Cells, options: PosesFile, warnings: list[Notice]) -> tuple[Cells, Integers]:
     """Return the rows of ``mapped`` without null poses, and the timestamps (M,) [ns] of the null poses.
 
-    A device reports null poses while it has lost its pose. Raises InputError if a quaternion is not a unit quaternion,
-    unless ``options`` skip such rows. If any rows are skipped, a warning is appended to ``warnings``."""
+    A null pose has a zero quaternion: the device had lost its pose. Raises InputError if another quaternion is not a
+    unit quaternion, unless ``options`` skip such rows. If any rows are skipped, a warning is appended to ``warnings``."""
     if "qw" not in mapped.columns:
         return mapped, np.zeros(0, dtype=np.int64)
     null = are_null(np.column_stack([mapped.numbers(name, COLUMNS[name]) for name in QUATERNION]))

@@ -101,9 +101,9 @@ def read_pose_file(path: Path, kind: Format | None = None, rules: RowRules | Non
     """Return the poses of a file in TUM, KITTI or EuRoC format. Their field ``warnings`` has warnings about it.
 
     ``kind``: the expected format, by default any. ``rules``: whether invalid rows are skipped, and rows sorted by time.
-    By default an invalid row and a decreasing timestamp are errors. Of poses with equal timestamps, the last is used.
-    Null poses mean that the device had lost its pose. They are skipped with a warning. Raises InputError with file and
-    row of an invalid value.
+    By default an invalid row and a decreasing timestamp are errors. Of poses with equal timestamps, the last is used. A
+    pose with a zero quaternion, which means that it was lost, is skipped with a warning. Raises InputError with file
+    and row of an invalid value.
     """
     row, first = _first_row(path)
     detected = _format(first)
