@@ -205,7 +205,7 @@ def _end_with_parent() -> None:
 
 @contextmanager
 def _without_script() -> Iterator[None]:
-    """Prevent new processes from importing the running script. It then needs no ``if __name__ == "__main__"``."""
+    """Prevent new processes from importing the running script. The script then needs no ``if __name__ == "__main__"``."""
     script = sys.modules["__main__"]
     sys.modules["__main__"] = ModuleType("__main__")
     try:

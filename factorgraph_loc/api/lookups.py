@@ -76,8 +76,7 @@ def known_sensors() -> list[SensorDescription]:
 
 
 def describe_sensor(name: str) -> SensorDescription:
-    """Return the description of a sensor. ``name``: its name, such as "rfid", or a name of its measurements, such as
-    "rssi".
+    """Return the description of a sensor. ``name``: its name ("rfid"), or that of some of its measurements ("rssi").
 
     Raises InputError if there is no such sensor.
     """

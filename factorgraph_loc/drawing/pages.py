@@ -58,8 +58,7 @@ def render(template: str, **values: Any) -> str:
 
 
 def sectioned(title: str, lead: str, doubts: Sequence[Notice], sections: Mapping[str, Sequence[Part]]) -> str:
-    """Return an HTML page with a heading for each section. ``lead``: the introduction. ``doubts``: highlighted
-    warnings.
+    """Return an HTML page with a heading for each section. ``lead``: the introduction. ``doubts``: marked warnings.
 
     ``sections``: {heading: parts}. A part is a paragraph, a table or a picture.
     """

@@ -218,7 +218,7 @@ def _camera(recording: rr.RecordingStream, log: Log, runs: Sequence[StoredRun]) 
 def _pixels_over_time(
     recording: rr.RecordingStream, at: str, t: Array, pixels: Sequence[Array], labels: Sequence[str] | None = None
 ) -> None:
-    """Draw points over images. ``pixels[i]`` (K, 2) is drawn at ``t[i]`` [s]. ``labels``: the name of each point."""
+    """Draw points over images. ``pixels[i]`` (K, 2) is drawn at ``t[i]`` [s]. ``labels``: names of the points of all images."""
     # the viewer's origin is a corner of the first pixel; the origin of ``pixels`` is the centre of the first pixel
     columns = rr.Points2D.columns(positions=np.concatenate(pixels) + 0.5, labels=labels)
     recording.send_columns(at, _times(t), columns.partition([len(p) for p in pixels]))

@@ -99,8 +99,7 @@ def _map(log: Log, make: "_Maker") -> list[dict[str, Any]]:
 
 
 def _poses(topic: str, frame: str, trajectory: Trajectory, t0_ns: int, make: "_Maker") -> Iterator[Message]:
-    """Yield two messages for each pose of a trajectory: the transform of ``frame`` on ``/tf``, and odometry on
-    ``topic``.
+    """Yield two messages per pose of a trajectory: the transform of ``frame`` on ``/tf``, and odometry on ``topic``.
 
     Odometry has the covariance of the pose, zero if it is unknown. ``t0_ns``: the absolute time [ns] of t = 0."""
     covariances = np.zeros((len(trajectory), 6, 6))

@@ -50,7 +50,7 @@ class RunFolder(FileModel, extra="ignore"):
 class StoredRun:
     """The estimates of one stored run of an estimator. Times are in seconds from the start of its log.
 
-    ``causal``: estimates that use only earlier measurements, since the first localization. ``final``: the trajectory
+    ``causal``: estimates from the first localization on, each from earlier measurements only. ``final``: the trajectory
     estimated from the whole log. Both may be empty. ``series``: times (K,) and values (K,) by name: ``error_position``
     [m], ``error_heading`` [rad], ``nees``. ``landmarks``: estimated landmarks by name. ``events``: times [s] and texts.
     """
@@ -98,8 +98,8 @@ def _stored(path: Path) -> list[Path]:
 def read_runs(folders: Sequence[RunFolder], log: Log) -> list[StoredRun]:
     """Return the estimates in the given folders of runs on ``log``.
 
-    Each gets a unique name: the estimator, with the seed and the folder appended if needed. Raises InputError if a run
-    is not of this log, or if a file is damaged.
+    Each run gets a unique name: the estimator, with the seed and the folder appended if needed. Raises InputError if a
+    run is of another log, or if a file is damaged.
     """
     names = [folder.estimator for folder in folders]
     with_seeds = [f"{folder.estimator}-seed{folder.seed}" for folder in folders]
@@ -136,7 +136,7 @@ def _read(folder: RunFolder, name: str, log: Log) -> StoredRun:
 
 
 def _check_times(run: StoredRun, log: Log) -> None:
-    """Raise InputError if estimates are outside of the time of ``log``. The run must then be of another log."""
+    """Raise InputError if an estimate is more than :data:`MARGIN` outside of the time span of ``log``."""
     first, last = log.span()
     for trajectory in (run.causal, run.final):
         if len(trajectory) and (trajectory.t[0] < first - MARGIN or trajectory.t[-1] > last + MARGIN):

@@ -127,9 +127,8 @@ def last_in_order(
     """Return the indices (M,) of the rows to use. Of rows with equal timestamps ``t_ns`` (N,), only the last is used.
 
     ``names``: the landmark of each row. If given, rows with equal timestamps and different landmarks are all used.
-    ``rows`` (N,): row numbers in the file ``source``. ``rules``: if given, errors name the key that sorts the rows.
-    Unsorted rows add a warning to ``warnings``. Raises InputError if a timestamp is over 0.5 s older than a previous
-    one.
+    ``rows`` (N,): row numbers in ``source``. ``rules``: if given, errors name the key that sorts the rows. Unsorted
+    rows add a warning to ``warnings``. Raises InputError if a timestamp is over 0.5 s older than a previous one.
     """
     arrivals(source, rows, t_ns, warnings, rules)
     keys: Iterable[Hashable] = t_ns.tolist() if names is None else zip(t_ns.tolist(), names, strict=True)

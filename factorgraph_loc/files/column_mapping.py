@@ -165,7 +165,7 @@ class TableFolder:
         self, cells: Cells, mapping: TimedMapping, columns: Mapping[str, Column], more: Sequence[Fault] = ()
     ) -> Cells:
         """Record that the rows and columns of ``cells`` are read. Return the valid cells, sorted by time if ``mapping``
-        says so.
+        sets it.
 
         ``columns``: the description of each field. ``more``: invalid cells that the caller has found in addition.
         """

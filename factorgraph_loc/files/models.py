@@ -195,7 +195,7 @@ def parse_model(kind: type[Model], content: Mapping[str, Any], source: object) -
 
 
 def known_keys(kind: type[BaseModel], path: tuple[int | str, ...]) -> list[str]:
-    """Return the field names of a nested model, for hints on misspelt keys. Return an empty list if there is no model.
+    """Return the field names of a nested model, for hints on misspelt keys. Return [] if ``path`` leads to no model.
 
     ``kind``: the outermost model. ``path``: the keys and list indices that lead from it to the nested model.
     """

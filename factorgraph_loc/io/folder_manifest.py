@@ -244,8 +244,9 @@ def _has_headings(table: Guess) -> bool:
 def _add_sizes(settings: dict[str, Any], table: Guess, sides: Sequence[str], roles: _Roles, path: Path) -> None:
     """Add the distance between the wheels, and the distance per encoder count, to the ``settings`` of odometry.
 
-    ``table``: the table of odometry. ``sides``: its fields of the wheels. ``roles``: the tables of all roles, and remarks.
-    The two distances are estimated from the reference. Without a reference they are examples, and a remark says so."""
+    ``table``: the table of odometry. ``sides``: its fields of the wheels. ``roles``: all tables, in the folder
+    ``path``. The two distances are estimated from the reference. Without a reference they are examples, and a remark
+    says so."""
     settings["track"] = TRACK
     if sides[0] != "left":
         if sides[0] in ("left_angle", "left_rate"):

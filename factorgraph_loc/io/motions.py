@@ -245,8 +245,8 @@ def _largest_before(rates: Array, least: float) -> Array:
 def _continued(source: object, t_ns: Integers, steps: Array, resets: Integers, warnings: list[Notice]) -> Array:
     """Return the ``steps`` (N - 1, D) between N timestamps ``t_ns``. Steps at the indices ``resets`` are unknown.
 
-    They are replaced by the step before each, scaled to their duration, but to at most :data:`HOLD_TIME`. If there are
-    resets, a warning that names the file ``source`` is appended to ``warnings``."""
+    Each is replaced by the previous step, scaled to its own duration, or to :data:`HOLD_TIME` if that is shorter. If
+    there are resets, a warning that names the file ``source`` is appended to ``warnings``."""
     durations = _durations(t_ns)
     for i in resets.tolist():
         previous = steps[i - 1] / durations[i - 1] if i else np.zeros(steps.shape[1])

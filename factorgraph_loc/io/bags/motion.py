@@ -104,11 +104,11 @@ class JointRows:
 
 
 def paired(lefts: TopicRows, rights: TopicRows, warnings: list[Notice]) -> tuple[Integers, Array]:
-    """Pair each message of the left wheel (``lefts``) with the message of the right wheel (``rights``) nearest in time.
+    """Return the timestamps (N,) [ns] and values (N, 2) of two wheels, left and right, from messages paired by time.
 
-    Returns the later timestamp of each pair (N,) [ns], and the wheel values (N, 2) of the pair, left and right. Pairs
-    are skipped if their times differ by more than :data:`MAX_OFFSET` times the median period. Then a warning is
-    appended to ``warnings``. Raises InputError if no pair remains.
+    Each message of the left wheel (``lefts``) is paired with the message of the right wheel (``rights``) nearest in
+    time. The timestamp is the later of the two. Pairs are skipped if their times differ by more than :data:`MAX_OFFSET`
+    times the median period. Then a warning is appended to ``warnings``. Raises InputError if no pair remains.
     """
     l_ns, left = lefts.in_order(("wheel",), warnings)
     r_ns, right = rights.in_order(("wheel",), warnings)

@@ -243,7 +243,7 @@ class FrameReference:
         return PosePath(self._source, poses[:, :3, 3], poses[:, :3, :3], t_ns, lost_ns=lost_ns)
 
     def _chain(self) -> list[str]:
-        """Return the frames from the child (included) to the parent (excluded). Raises InputError without a path."""
+        """Return the frames from the child (included) to the parent (excluded). Raises InputError if they are not connected."""
         parents = self._static.parents | self._parents
         chain = frame_and_ancestors(parents, self._child)
         if self._parent in chain:

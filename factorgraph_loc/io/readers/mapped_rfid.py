@@ -44,7 +44,7 @@ STANDARD = str.maketrans("-_", "+/")  # converts URL-safe base64 to standard bas
 
 
 def read_wide(path: Path, mapping: ColumnMapping, antenna: str | None) -> Cells:
-    """Return the reads of a table with several columns of signal strengths, whose names match a pattern such as
+    """Return the reads of a table with several columns of signal strengths. Their names match a pattern such as
     ``rssi_*``.
 
     ``mapping``: the columns of the fields; the pattern is the column of ``rssi``. Each cell of a matching column that

@@ -48,7 +48,8 @@ class Options(FileModel):
 def read(path: Path | None, options: Options) -> Log:
     """Return the log of the run ``options.run`` from the file ``path``, by default the file in the gtsam wheel.
 
-    Its t = 0 is the first row of the ground truth. Raises InputError with file, array and row (from 1) of the array.
+    Its t = 0 is the first row of the ground truth. Raises InputError with the file, the array, and the row, counted
+    from 1.
     """
     file = path or shipped(options.run)
     fields, unread = read_matlab(file, FIELDS)
