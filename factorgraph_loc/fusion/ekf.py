@@ -241,9 +241,9 @@ class Ekf(Filter):
         ((self._odometry, self._step, self._state, _),) = self._predictions((t,))
 
     def _predictions(self, times: Sequence[float]) -> list[tuple[ChainState, _Step, _State, Array]]:
-        """Return (odometry, step, state, covariance) for each of ``times`` [s]: the integrated odometry, the prediction
-        step from the previous of these times, the predicted state, and the pose's covariance (3, 3) in the world
-        frame."""
+        """Return one tuple (odometry, step, state, covariance) for each of ``times`` [s]. ``odometry``: the integrated
+        odometry. ``step``: the prediction step from the previous of these times. ``state``: the predicted state.
+        ``covariance`` (3, 3): of its pose, in the world frame."""
         s = self._state
         part = s.layout.columns.get(MOTION, NOWHERE)
         constants = s.rest[part.start - POSE : part.stop - POSE]

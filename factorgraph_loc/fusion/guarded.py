@@ -34,8 +34,7 @@ class Guard:
     """Calls an estimator and converts its exceptions to a RunFailedError.
 
     Use it as ``guard.process(estimator, measurement)`` or ``with guard.computing(what): ...``. ``who``: the name of the
-    estimator, and of the log if there is one, for messages. NumPy's warnings are silenced during these calls, because
-    :func:`sound` and :func:`sound_trajectory` check the results.
+    estimator, and of the log if there is one, for messages. NumPy's warnings are silenced during these calls.
     """
 
     def __init__(self, who: str) -> None:
@@ -48,8 +47,8 @@ class Guard:
 
     @contextmanager
     def quiet(self) -> Iterator[None]:
-        """Return a context that silences NumPy's warnings for a whole run. To silence them for each measurement would
-        double the time of an odometry measurement."""
+        """Return a context that silences NumPy's warnings for a whole run. This is faster than to silence them for each
+        measurement."""
         with np.errstate(all="ignore"):
             self._is_quiet = True
             try:
@@ -64,8 +63,9 @@ class Guard:
             estimator.process(measurement)
 
     def computing(self, what: str, t: float | None = None) -> Self:
-        """Return a context for a request to the estimator: an exception inside becomes a RunFailedError. Its message
-        names ``what``, the requested result, such as "the estimate", and ``t`` [s], its time, unless None."""
+        """Return a context for a request to the estimator. An exception inside becomes a RunFailedError. ``what``: the
+        requested result for the message, such as "the estimate". ``t`` [s]: the time of the result for the message, or
+        None."""
         self._computing, self._of = what, t
         return self
 

@@ -14,7 +14,7 @@ KERNEL = 0.25  # standard deviation of a kernel as a fraction of the distance be
 
 
 def enough(cells: Array | NDArray[np.int64]) -> Array:
-    """Return the number of particles that KLD sampling needs if ``cells`` is the number of occupied grid cells. Source:
+    """Return the number of particles that KLD sampling needs. ``cells``: the number of occupied grid cells. Source:
     Fox, 2003, eq. 7, with the approximation of Wilson and Hilferty."""
     freedom = np.maximum(np.asarray(cells, dtype=float) - 1.0, 1.0)
     a = 2.0 / (9.0 * freedom)
@@ -23,10 +23,9 @@ def enough(cells: Array | NDArray[np.int64]) -> Array:
 
 def prefix(poses: Array, rng: np.random.Generator, least: int) -> NDArray[np.int64]:
     """Return the indices of a random subset of ``poses`` (N, 3), chosen by KLD sampling. It has at least ``least``
-    poses, if N allows.
+    poses, or all if N is smaller.
 
-    Poses are added in random order until their number is :func:`enough` for the grid cells that they occupy, or all are
-    added.
+    Poses are added in random order, until their number is :func:`enough` for the number of grid cells that they occupy.
     """
     order = rng.permutation(len(poses))
     _, first = np.unique(cell_numbers(poses[order], CELL), return_index=True)
@@ -41,8 +40,8 @@ def jittered(poses: Array, rows: NDArray[np.int64], rng: np.random.Generator, ro
     indices of the kernels' centres.
 
     The kernel's width is proportional to the cube root of the volume per particle. This volume is the number of
-    occupied grid cells, divided by the number of distinct centres. ``room`` (K,): a lower limit of it for each new
-    pose.
+    occupied grid cells, divided by the number of distinct centres. ``room`` (K,): a lower limit of this volume for each
+    new pose, in grid cells.
     """
     chosen = poses[rows]
     cells = len(np.unique(cell_numbers(chosen, CELL)))

@@ -44,12 +44,12 @@ class Layout:
         return columns
 
     def plus(self, name: str, size: int) -> Layout:
-        """Return the layout with one more block at the end. ``name``: of its sensor or landmark. ``size``: its number
-        of components."""
+        """Return the layout with one more block at the end. ``name``: the name of the sensor or landmark. ``size``: the
+        number of components of the block."""
         return Layout({**self.sizes, name: size})
 
     def values(self, rest: Array) -> dict[str, Array]:
-        """Return the part of each block in ``rest`` by name. ``rest`` (R,): the state without the pose."""
+        """Return {name of a block: its part of ``rest``}. ``rest`` (R,): the state without the pose."""
         return {name: rest[part.start - POSE : part.stop - POSE] for name, part in self.columns.items()}
 
 
@@ -59,7 +59,7 @@ def constants_of(motion: Motion, sensors: Mapping[str, Sensor]) -> dict[str, Est
 
 
 def on_pose(observation: Observation, view: View) -> Observation:
-    """Return an observation as a function of the pose only. Sensor constants and landmarks are fixed at their
+    """Return ``observation`` as a function of the pose only. Sensor constants and landmarks are fixed at their
     estimates, and their covariances are added to the noise. ``view``: gives access to the estimates."""
     values = {name: np.asarray(view.value(name)) for name in observation.blocks}
     return observation.on_pose(values, {name: view.block_covariance(name) for name in observation.blocks})

@@ -151,7 +151,8 @@ class ParticleFilter(Filter):
         return learnt_from(self._constants, ((name, *parts) for name, parts in moments.items()))
 
     def trajectory(self) -> Trajectory:
-        """Return means and covariances of trajectories from backward simulation, or causal ones without ``smooth``."""
+        """Return the trajectory smoothed by backward simulation, or the estimates during the run if ``smooth`` is
+        off."""
         last = {r.t: r for r in self._records}
         records = [last[t] for t in sorted(set(self._ticks))]
         if not self._smooth or not records:
@@ -173,7 +174,7 @@ class ParticleFilter(Filter):
         return Trajectory(np.array([r.t for r in records]), poses, np.array([c for _, c in moments]).reshape(-1, 3, 3))
 
     def forget(self, until: float) -> None:
-        """Delete the trajectory before ``until`` [s], except for the last particles before it that smoothing needs."""
+        """Delete the trajectory before ``until`` [s], except the last particles before it, which smoothing needs."""
         clouds = [r.t for r in self._records if r.cloud is not None and r.t <= until]
         super().forget(max(clouds, default=-math.inf) if self._smooth else until)
 
@@ -208,8 +209,9 @@ class ParticleFilter(Filter):
     def _sampled_cloud(self, since: float) -> Cloud | None:
         """Return particles drawn from the result of the global search, or None if there is no result yet.
 
-        If the search has found one clear pose, the filter is then localized, and sensors restart at the time ``since``
-        [s]. If the filter was localized before ``since``, the sensor constants from that time are used again.
+        If the search has found one clear pose, the filter is localized, and sensors restart at the time ``since`` [s].
+        The sensor constants are from the last localized particles before ``since``, or from the prior if there are
+        none.
         """
         clouds = (r.cloud for r in reversed(self._records) if r.cloud is not None and r.t < since)
         previous = next((cloud for cloud in clouds if cloud.localized), None)
@@ -246,7 +248,7 @@ class ParticleFilter(Filter):
         self._odometry, _ = self._motion.travelled(self._odometry, t)
 
     def _moved_on(self, rng: np.random.Generator) -> Cloud:
-        """Return the particles moved by odometry to the time of the filter."""
+        """Return the particles moved by odometry, with noise drawn from ``rng``, to the time of the filter."""
         cloud = self._state
         if cloud.odometry.t == self._t:
             return cloud
@@ -256,7 +258,7 @@ class ParticleFilter(Filter):
         return replace(cloud, poses=poses, odometry=self._odometry)
 
     def _moments(self) -> tuple[Array, Array]:
-        """Return mean (3,) and covariance (3, 3) of the present pose in the world frame."""
+        """Return mean (3,) and covariance (3, 3) of the current pose in the world frame."""
         cloud = self._state
         if cloud.odometry.t == self._t:
             return cloud.moments
@@ -268,8 +270,8 @@ class ParticleFilter(Filter):
         return poses[0], worlds[0]
 
     def _moved(self, cloud: Cloud, increment: Increment, noise: Array | None = None) -> tuple[Array, Array]:
-        """Return poses (N, 3) of ``cloud`` moved by odometry, with the particles' own constants and body-frame
-        ``noise``. Also returns the Jacobian (3, 3+P) of the pose by body-frame perturbation and constants."""
+        """Return the poses (N, 3) of ``cloud`` moved by odometry, with each particle's constants and with body-frame
+        ``noise``. Also returns the Jacobian (3, 3+P) of the new pose by body-frame perturbation and constants."""
         by_constants = np.zeros((3, cloud.constants.shape[1]))
         delta = increment.delta
         part = cloud.parts.get(MOTION)
@@ -334,11 +336,9 @@ class ParticleFilter(Filter):
         self._changes = [(rejected, change) for rejected, change in self._changes if rejected <= self._t]
 
     def _weigh(self, observation: Observation) -> float:
-        """Weigh the particles by an observation, and return the logarithm of the mean likelihood.
-
-        If the observation is costly, a few particles are corrected first
-        (:func:`~factorgraph_loc.fusion.cloud.corrected`). Then all are drawn from these and corrected by the last step.
-        """
+        """Weigh the particles by an observation, and return the logarithm of the mean likelihood. If the observation is
+        costly, a few particles are corrected first, by a part of the likelihood. Then all particles are drawn from
+        these, and corrected by the rest."""
         cloud, count, enough = self._state, self._settings.particles, self._settings.resample_below
 
         @in_one_step
@@ -390,7 +390,7 @@ class ParticleFilter(Filter):
         return Record(self._t, self._odometry, estimate.pose, estimate.covariance, self._state if keep else None)
 
     def _is_due(self) -> bool:
-        """Return True if smoothing needs the present particles: the interval is over, or they have jumped."""
+        """Return True if smoothing needs the current particles: its interval is over, or the pose has just jumped."""
         if self.diagnostics.events and self.diagnostics.events[-1].t == self._t:
             return True
         last = next((r.t for r in reversed(self._records) if r.cloud is not None), -math.inf)

@@ -100,8 +100,9 @@ class BackwardSimulation:
         return _moments(poses, extra)
 
     def _step(self, cloud: Cloud, increment: Increment, later: Cloud) -> tuple[Cloud, Array]:
-        """Return an ancestor from ``cloud`` for each of the M later states ``later``, drawn at random. Also returns the
-        differences (M, 3) between their motions and the odometry. ``increment``: the odometry in between."""
+        """Return a random ancestor from ``cloud`` for each of the M later states ``later``. Also returns the
+        differences (M, 3) between the motions from the ancestors and the odometry. ``increment``: the odometry from
+        ``cloud`` to ``later``."""
         smooth, kernel = cloud.density()
         # without constants that were added later
         later = replace(later, constants=later.constants[:, : cloud.constants.shape[1]])

@@ -63,7 +63,7 @@ BEGUN = 80  # cost of drawing one initial particle, including the preparation of
 
 
 class Evidence(Protocol):
-    """The attributes and the method of an :class:`~factorgraph_loc.sensors.base.Observation` that particles need."""
+    """The part of the interface of an :class:`~factorgraph_loc.sensors.base.Observation` that particles need."""
 
     @property
     def found(self) -> int: ...
@@ -135,8 +135,8 @@ class Population:
 
     @property
     def best(self) -> PosePrior | None:
-        """The robot's pose at the time of the last processed observation. None if no mode meets a limit in
-        :data:`CLEAR`."""
+        """The robot's pose at the time of the last processed observation. None unless the weight of the best mode
+        exceeded a limit in :data:`CLEAR` for long enough."""
         at = self.newest
         if at is None or all(at.t < since + lasts for since, (_, lasts) in zip(self._since, CLEAR, strict=True)):
             return None
@@ -150,9 +150,9 @@ class Population:
         return (self._cloud.poses, self._cloud.weights) if self._cloud is not None else (np.empty((0, 3)), np.empty(0))
 
     def add(self, odometry: ChainState, observation: Evidence, evidence: float = 0.0) -> bool:
-        """Queue an observation. ``odometry``: the integrated odometry at its time. ``evidence``: see
-        :class:`WeighedObservation`. Returns False if the observation is ignored, because it is older than the last one
-        in the queue."""
+        """Queue an observation. ``odometry``: the integrated odometry at its time. ``evidence``: the log-probability of
+        the observation if the estimator's pose is right. Returns False if the observation is ignored, because it is
+        older than the last one in the queue."""
         newest = self._waiting[-1].odometry if self._waiting else self._begun
         if newest is not None and odometry.t < newest.t:
             return False
@@ -160,8 +160,8 @@ class Population:
         return True
 
     def advance(self, work: float = math.inf) -> bool:
-        """Process queued observations until the computing cost exceeds ``work``, in units of some nanoseconds. Returns
-        True if at least one observation was processed completely."""
+        """Process queued observations until their computing cost exceeds ``work``, in units of a few nanoseconds.
+        Returns True if at least one observation was processed completely."""
         done = False
         while work > 0.0 and (self._running is not None or self._waiting):
             if self._running is None:
@@ -175,8 +175,9 @@ class Population:
         return done
 
     def sample(self, rng: np.random.Generator, count: int) -> Array:
-        """Return ``count`` random poses (N, 3) at the time of the last processed observation. They are near
-        :attr:`best` or, if it is None, drawn from all particles. The array is empty before the first observation."""
+        """Return ``count`` random poses (N, 3) at the time of the last processed observation. They are drawn from the
+        particles near :attr:`best` or, if it is None, from all particles. The array is empty before the first
+        observation."""
         if self._cloud is None:
             return np.empty((0, 3))
         best, weights = self.best, self._cloud.weights
@@ -267,7 +268,7 @@ class Population:
 
     def _room_of(self, count: int) -> Array:
         """Return the volume (N,) per particle, in grid cells, if ``count`` particles are drawn from all possible poses.
-        Returns zeros if the start position is known."""
+        It is zero if the start position is known."""
         return np.full(count, self._volume / float(np.prod(kld.CELL)) / count if self._start is None else 0.0)
 
     def _draw_anywhere(self, count: int, now: ChainState) -> Array:

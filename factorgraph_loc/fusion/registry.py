@@ -34,15 +34,14 @@ class Description:
 def settings_of(name: str, overrides: Mapping[str, Any]) -> FileModel:
     """Return the settings of the estimator ``name``: the defaults, changed by ``overrides``.
 
-    ``overrides``: values by key, such as ``lag``. The parts of a key of a nested setting are separated by dots.
-
-    Raises InputError if the estimator or a key is unknown, or if a value is out of bounds.
+    ``overrides``: {key: value}, such as {"lag": 10.0}. The parts of a nested key are separated by dots. Raises
+    InputError if the estimator or a key is unknown, or if a value is out of bounds.
     """
     return parse_model(settings_type(name), overrides, f"settings of {name}")
 
 
 def create(name: str, setup: Setup, settings: FileModel) -> Estimator:
-    """Return a new estimator of the class called ``name``. ``setup``: the robot, the map, the sensors to use, and a
+    """Return a new estimator. ``name``: the name of its class. ``setup``: the robot, the map, the sensors to use, and a
     random generator. ``settings``: the settings of the estimator."""
     return cast(Estimator, estimator_type(name)(setup, settings))
 

@@ -70,16 +70,16 @@ class Search:
         return bool(self._finders) or self._weighs
 
     def serves(self, sensor: Sensor) -> bool:
-        """Return True if the search uses this sensor."""
+        """Return True if ``sensor`` is one of the search's sensors."""
         return sensor.name in self._sensors
 
     def remember(self) -> None:
-        """Store odometry for longer than usual, so that a search can begin at an earlier time."""
+        """Store odometry for longer than by default, so that a search can begin at an earlier time."""
         self._motion.horizon = self._horizon = 2.0 * DURATION
 
     def begin(self, start: KnownPosition | None) -> None:
-        """Begin a search for the heading at a known position ``start``. If ``start`` is None, position and heading
-        count as unknown."""
+        """Begin a search for the heading at the known position ``start``. None begins a search for position and
+        heading."""
         self.start = start
         for finder in self._finders.values():
             finder.start = start
@@ -107,19 +107,19 @@ class Search:
         return self.advance(odometry.t) or is_informative
 
     def queue(self, observation: Evidence, odometry: ChainState) -> None:
-        """Queue an observation that is not from a sensor of the search, such as the free distances of a proximity
-        sensor.
+        """Queue an observation of an additional sensor, such as a proximity sensor, for the next call of
+        :meth:`advance`.
 
-        The particles process it in :meth:`advance`. It is ignored if they have not yet processed an observation of the
-        search's own sensors. ``odometry``: the integrated odometry at the observation's time.
+        It is ignored if the particles have not yet processed an observation of the search's own sensors. ``odometry``:
+        the integrated odometry at the observation's time.
         """
         if self._population is not None and self._population.newest is not None:
             self._population.add(odometry, observation)
 
     def advance(self, t: float) -> bool:
         """Weigh the particles by queued observations, at a limited computing cost. Returns True if at least one
-        observation was processed completely. ``t`` [s]: the present time. A call soon after the previous one does
-        nothing."""
+        observation was processed completely. ``t`` [s]: the current time. A call less than :data:`PAUSE` after the
+        previous one does nothing."""
         if self._population is None or (t < self._advanced + PAUSE and self._work < math.inf):
             return False
         self._advanced = t
@@ -145,7 +145,8 @@ class Search:
         return self._population is not None and self._population.waits
 
     def _denied(self, place: PosePrior) -> bool:
-        """Return True if the particles reject ``place``, a pose from one sensor, or have unprocessed observations."""
+        """Return True if the particles contradict ``place``, a pose that was computed from one sensor, or have
+        unprocessed observations."""
         return self._population is not None and (self._population.waits or self._population.denies(place))
 
     def modes(self, t: float) -> list[Mode]:
@@ -161,8 +162,8 @@ class Search:
         ]
 
     def particles(self, t: float) -> tuple[Array, Array] | None:
-        """Return poses (N, 3) at time ``t`` [s] and weights (N,) of the particles. Returns None if the result of the
-        search is not from particles."""
+        """Return poses (N, 3) at time ``t`` [s] and weights (N,) of the particles. Returns None if the search has no
+        result, or has it from a single sensor."""
         leading = self._leading
         if not isinstance(leading, Population) or leading.newest is None:
             return None
@@ -188,8 +189,9 @@ class Search:
 
     @property
     def _leading(self) -> Finder | Population | None:
-        """The source of the present result, None if there is no result. A finder computes a pose from one sensor alone.
-        The order of preference is: a finder that needs only one measurement, the particles, any other finder."""
+        """The source of the current result, None if there is no result. It is a finder, which computes a pose from one
+        sensor alone, or the particles. Finders that need only one measurement are preferred to particles, and particles
+        to other finders."""
         informative = [finder for finder in self._finders.values() if finder.newest is not None]
         for finder in informative:
             if finder.at_once and (self._population is None or finder.best is not None):
@@ -199,7 +201,8 @@ class Search:
         return next(iter(informative), None)
 
     def _is_due(self, sensor: Sensor, t: float) -> bool:
-        """Return True if the particles' last observation of this sensor is old enough at ``t`` [s] for another one."""
+        """Return True if the particles may process another observation of ``sensor`` at ``t`` [s], because the last one
+        is old enough."""
         last = self._last.get(sensor.name, -math.inf)
         if t <= last or t < last + sensor.evidence_every:
             return False

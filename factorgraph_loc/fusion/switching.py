@@ -88,7 +88,8 @@ class Switching:
         self._active.initialize(prior)
 
     def process(self, measurement: Measurement) -> None:
-        """Process one measurement. If it is late by more than ``max_delay``, it is counted and ignored."""
+        """Process one measurement. A measurement that is older than the newest one by more than ``max_delay`` is
+        counted and ignored."""
         if measurement.is_motion:
             self._tags.process(measurement)
             counted = self.diagnostics.ignored, self.diagnostics.late
@@ -142,15 +143,16 @@ class Switching:
         return at_ticks(ticks, np.array(times), poses, covariances)
 
     def forget(self, until: float) -> None:
-        """Delete the trajectory before the time ``until`` [s], except for what late measurements can still change."""
+        """Delete the trajectory before the time ``until`` [s]. The part that a measurement with a delay up to
+        ``max_delay`` can still change is not deleted."""
         for part in (self._tags, self._vision):
             part.forget(until)
         self._ticks = [t for t in self._ticks if t >= until]
         self._records = {t: record for t, record in self._records.items() if t >= until}
 
     def _hand_over(self, successor: Filter) -> None:
-        """Replace the filter in use by ``successor``, which starts at the present pose. Nothing happens if the pose is
-        not localized."""
+        """Use the filter ``successor`` from now on, and start it at the current pose. Does nothing if the pose is not
+        localized."""
         if successor is self._active:
             return
         now = self._active.estimate()
@@ -168,8 +170,8 @@ class Switching:
 
 def _smoothed(record: _PoseBelief, step: Increment, later: tuple[Array, Array]) -> tuple[Array, Array]:
     """Return the smoothed pose (3,) and covariance (3, 3) of ``record``. ``step``: the motion to the next record.
-    ``later``: the smoothed pose and covariance of the next record. If these contradict ``record`` and ``step``,
-    ``record`` is not smoothed."""
+    ``later``: the smoothed pose and covariance of the next record. If these contradict ``record`` and ``step``, the
+    pose and covariance of ``record`` are returned unchanged."""
     predicted = propagate(record.covariance, step)
     error = se2.log(se2.between(se2.compose(record.pose, step.delta), later[0]))
     if positive.squared(error, predicted + later[1]) > JUMPED:

@@ -29,8 +29,8 @@ from factors.motion import Increment
 
 
 class Taken(NamedTuple):
-    """A processed measurement. ``checkpoint``: the estimator's state before the measurement, None if it is not needed.
-    ``added``: the entries that the measurement added to the diagnostics, to remove them if the measurement is processed
+    """A processed measurement. ``checkpoint``: a copy of the estimator's state before the measurement, or None if it is
+    not needed. ``added``: the entries that the measurement added to the diagnostics, to remove them if it is processed
     again."""
 
     measurement: Measurement
@@ -39,7 +39,8 @@ class Taken(NamedTuple):
 
 
 class Timeline(ABC):
-    """The base class of estimators that process measurements in order of time. Late measurements are also allowed."""
+    """The base class of estimators that process measurements in order of time. A measurement may also arrive after
+    newer ones."""
 
     deterministic = True
     takes_rows = True  # one measurement may contain several rows of odometry
@@ -55,7 +56,8 @@ class Timeline(ABC):
         self._seeking: Tracking | None = None  # the search for the start pose, None if there is none
 
     def process(self, measurement: Measurement) -> None:
-        """Process one measurement. If it is late by more than ``max_delay``, it is counted and ignored."""
+        """Process one measurement. A measurement that is older than the newest one by more than ``max_delay`` is
+        counted and ignored."""
         self._renew(measurement)
         if measurement.is_motion:
             self._motion.add(measurement)
@@ -71,8 +73,8 @@ class Timeline(ABC):
     def estimate(self, t: float | None = None) -> PoseEstimate:
         """Return the pose at the time of the newest measurement or recorded pose, or at ``t`` [s] if that is later.
 
-        Before the start, the estimate is the most likely result of the search for the start pose, with the status
-        ``ambiguous``. If there is none, it is NaN, with the status ``unlocalized``. After the start, the status is
+        Before the estimator has started, this is the most likely result of the search for the start pose, with the
+        status ``ambiguous``. If there is none, it is NaN, with the status ``unlocalized``. Later, the status is
         ``ambiguous`` while a search is in progress, and while the estimated poses contradict the measurements.
         """
         if self._begun < math.inf:
@@ -86,8 +88,8 @@ class Timeline(ABC):
         return PoseEstimate(at, modes[0].pose, modes[0].covariance, "ambiguous")
 
     def belief(self, t: float | None = None) -> Belief:
-        """Return the probability distribution of the pose, at the same time as :meth:`estimate`. Before the start, it
-        has all hypotheses of the search for the start pose, and the particles of this search."""
+        """Return the probability distribution of the pose, at the same time as :meth:`estimate`. Before the estimator
+        has started, it has all hypotheses and particles of the search for the start pose."""
         if self._begun < math.inf or self._seeking is None:
             return gaussian_belief(self.estimate(t))
         at = self._t if t is None else max(t, self._t)
@@ -100,11 +102,12 @@ class Timeline(ABC):
 
     @abstractmethod
     def _estimate_at(self, t: float | None) -> PoseEstimate:
-        """Return the result of :meth:`estimate` after the start."""
+        """Return the result of :meth:`estimate`. Called only after the estimator has started."""
 
     @abstractmethod
     def _process(self, m: Measurement) -> None:
-        """Process a measurement that is not too late, after the start."""
+        """Process the measurement ``m``, which is at most ``max_delay`` older than the newest. Called only after the
+        estimator has started."""
 
     def _renew(self, m: Measurement) -> None:
         """Discard cached results. Called when a measurement arrives."""
@@ -115,7 +118,7 @@ class Timeline(ABC):
         return m.source in self._sensors
 
     def _begin(self, m: Measurement) -> None:
-        """Process a measurement before the start."""
+        """Process the measurement ``m`` while the estimator has no start pose yet."""
         if self._seeking is not None:
             self._seek_start(m, self._seeking)
 
@@ -125,8 +128,8 @@ class Timeline(ABC):
         search.begin(KnownPosition(prior, self._motion))
 
     def _seek_start(self, m: Measurement, search: Tracking) -> None:
-        """Update the search for the start pose by the measurement ``m``. If this determines the pose, start the
-        estimator there and process all measurements since the start again."""
+        """Update the search for the start pose by the measurement ``m``. If this determines the pose, the estimator
+        starts there, and processes the stored measurements again."""
         start = search.start
         if start is not None:
             start.settle()
@@ -159,13 +162,13 @@ class Timeline(ABC):
         raise NotImplementedError
 
     def _replay(self, measurements: Sequence[Measurement]) -> None:
-        """Process measurements again, in this order."""
+        """Process the ``measurements`` again, in their order."""
         for m in measurements:
             self._process(m)
 
     def _remember(self, taken: Taken, span: float) -> None:
-        """Store the processed measurement ``taken``. Stored measurements that are more than ``span`` [s] older are
-        deleted."""
+        """Store the processed measurement ``taken``. Delete stored measurements that are more than ``span`` [s]
+        older."""
         self._taken.append(taken)
         while self._taken[0].measurement.t < taken.measurement.t - span:
             self._taken.popleft()

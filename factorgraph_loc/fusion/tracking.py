@@ -68,7 +68,8 @@ SPARE = 1e-3  # s: a gap exceeds MAX_GAP by at least this much
 
 
 def is_known(t: Array, changes: Iterable[Change]) -> NDArray[np.bool_]:
-    """Return a mask (N,) of the times ``t`` (N,) [s] outside of all ``changes``, intervals with a carried robot."""
+    """Return a mask (N,) that is True at times ``t`` (N,) [s] outside of ``changes``, the intervals when the robot was
+    carried."""
     known = np.ones(len(t), dtype=bool)
     for last, first in changes:
         more = 0.5 * max(MAX_GAP + SPARE - (first - last), 0.0)
@@ -134,9 +135,9 @@ class Tracking(Search):
         return is_doubted(self._sensors.values())
 
     def expect(self, sensor: Sensor, observation: Observation, odometry: ChainState, view: View) -> None:
-        """Process an observation that will correct the pose. A sensor that can determine a pose alone checks the
-        estimated poses with it. ``odometry``: the integrated odometry at its time. ``view``: gives access to the
-        estimator's state before the correction."""
+        """Process an observation that will correct the pose. If ``sensor`` can determine a pose alone, it compares this
+        with the estimated pose. ``odometry``: the integrated odometry at the observation's time. ``view``: gives access
+        to the estimator's state before the correction."""
         if sensor.finder is not None:
             sensor.finder.follow(observation, odometry, view)
             self._looked.append(odometry.t)
@@ -146,9 +147,9 @@ class Tracking(Search):
     def keep(
         self, sensor: Sensor, observation: Observation, odometry: ChainState, evidence: Callable[[], float]
     ) -> None:
-        """Store an observation that has corrected the estimated pose. A later global search may use it. ``odometry``:
-        the integrated odometry at its time. ``evidence()``: returns the log-probability of the observation if the
-        estimated pose is right."""
+        """Store an observation that has corrected the estimated pose, so that a later global search can use it.
+        ``odometry``: the integrated odometry at its time. ``evidence()``: returns the log-probability of the
+        observation if the estimated pose is right."""
         current = observation.at_its_time() if self._weighs else None
         if current is None or not self._is_due(sensor, odometry.t):
             return
@@ -212,10 +213,12 @@ class Tracking(Search):
         return PosePrior(now.t, pose, best.covariance + se2.body_to_world(pose, since.covariance))
 
     def _change(self, best: PosePrior, pose_at: Callable[[float, Array], Array]) -> tuple[float, Change]:
-        """Return the most likely time [s] of the track's (the estimated poses') first error, and an interval around it.
+        """Return the most likely time [s] when the track (the estimated poses) became wrong, and an interval that
+        contains it.
 
-        ``best``: the robot's present pose. Observations before that time are more likely given the track, later ones
-        given ``best``.
+        ``best``: the robot's current pose. ``pose_at(t, pose)``: returns the pose (3,) at an earlier time ``t`` [s] if
+        the current pose is ``pose``. Before the returned time observations are more likely given the track, later given
+        ``best``.
         """
         times: list[float] = []
         likelihoods: list[float] = []  # logarithms, of a change just before each time
@@ -236,7 +239,7 @@ class Tracking(Search):
 
     def begin_track(self, *, by_search: bool) -> None:
         """End the search, because the estimator continues at a new pose. ``by_search``: True if the search found this
-        pose, so that the estimator processes the stored observations again. False if the pose is from a prior."""
+        pose, and the estimator will process the stored observations again. False if the pose is from a prior."""
         self.end()
         if by_search:
             self._kept.clear()
@@ -248,7 +251,7 @@ class _Compared(NamedTuple):
 
     ``odometry``: the integrated odometry at its time. ``observed()``: returns the observation as a function of its
     pose, or None. ``pose`` (3,), ``covariance`` (3, 3): the predicted pose and its body-frame covariance. ``offset``:
-    the motion from that pose to the observation, or None. ``correction``: by the observation.
+    the motion from that pose to the observation, or None. ``correction``: the correction of the pose.
     """
 
     odometry: ChainState
@@ -310,15 +313,15 @@ class SlipMonitor:
                 self._compared = t
 
     def _are_surprising(self, t: float) -> bool:
-        """Return True if the last observations together differ more from their predictions than random errors do."""
+        """Return True if the differences of the last observations from their predictions are larger than random
+        errors."""
         newest = [surprise(row.correction) for row in self._rows if row.odometry.t >= t - WINDOW / 2.0]
         return sum(newest) > SURPRISING * math.sqrt(len(newest))
 
     def _log_odds(self, begin: float) -> tuple[float, float]:
-        """Return the log-odds that the odometry is wrong since about ``begin`` [s], and the time [s] of the first
-        error.
+        """Return the log-odds that the odometry is wrong since a time near ``begin`` [s], and this time [s].
 
-        This is the time of the first observation from ``begin`` on that agrees with its prediction. The log-odds are
+        This time is that of the first observation from ``begin`` on that agrees with its prediction. The log-odds are
         zero with too few observations or too little motion.
         """
         rows = [row for row in self._rows if row.odometry.t >= begin]
@@ -351,16 +354,16 @@ class SlipMonitor:
 
 
 def surprise(correction: Correction) -> float:
-    """Return how far a correction's squared innovation, or its negative log-likelihood, exceeds the expected value. The
-    unit is the standard deviation."""
+    """Return the difference of a correction's squared innovation, or of its negative log-likelihood, from the expected
+    value. The unit is the standard deviation."""
     if correction.dof:
         return (correction.nis - correction.dof) / math.sqrt(2.0 * correction.dof)
     return correction.excess_nll / math.sqrt(correction.variance) if correction.variance > 0.0 else 0.0
 
 
 def is_doubted(sensors: Iterable[Sensor]) -> bool:
-    """Return True if a sensor's measurements contradict the estimated poses, or if it detects nothing where it
-    should."""
+    """Return True if the measurements of one of ``sensors`` contradict the estimated poses, or lack expected
+    detections."""
     return any(sensor.suspicious_since is not None or sensor.silent for sensor in sensors)
 
 

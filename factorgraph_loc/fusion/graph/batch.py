@@ -53,8 +53,8 @@ def convex_width(graph: Graph, values: Values) -> float:
 
 
 def best_optimum(graph: Graph, start: Values, widest: float) -> tuple[Problem, Solution]:
-    """Return a least-squares problem and its optimum. A graph is optimised directly and by graduated non-convexity, and
-    the optimum with the lower cost is returned.
+    """Return a least-squares problem and its optimum. The graph is optimised directly and by graduated non-convexity,
+    and the optimum with the lower cost is returned.
 
     ``start``: initial values. ``widest``: the initial factor on the scales of the robust losses. If it is 1 and the
     losses of loop closures are convex, only the direct optimum is computed.

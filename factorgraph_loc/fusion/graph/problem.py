@@ -59,17 +59,18 @@ class IndeterminateError(RuntimeError):
 
 @dataclass(frozen=True)
 class Covariances:
-    """Marginal covariances of variables. ``by_key``: an array (d, d) per key. ``damping``: the prior information that
-    was added to compute them, as a fraction of the diagonal of the information matrix. It is 0 if none was needed."""
+    """Marginal covariances of variables. ``by_key``: {key: covariance (d, d)}. ``damping``: the strength of an
+    additional prior, as a fraction of the diagonal of the information matrix. It is 0 if none was needed to compute
+    them."""
 
     by_key: dict[int, Array]
     damping: float
 
 
 def covariances(graph: gtsam.GaussianFactorGraph, sizes: Mapping[int, int], keys: Sequence[int]) -> Covariances:
-    """Return the marginal covariances of the variables ``keys`` of a linear graph. ``sizes``: the number of components
-    of each variable of the graph by key. Raises IndeterminateError if the graph does not determine a variable, even
-    with weak priors."""
+    """Return the marginal covariances of the variables ``keys`` of a linear ``graph``. ``sizes``: the number of
+    components of each variable of the graph, by key. Raises IndeterminateError if the graph does not determine a
+    variable, even with weak priors."""
     result = _solved(graph, keys, robust=False)
     if isinstance(result, dict):
         return Covariances(result, 0.0)
@@ -81,7 +82,8 @@ def covariances(graph: gtsam.GaussianFactorGraph, sizes: Mapping[int, int], keys
 
 
 def blamed(error: Exception) -> int | None:
-    """Return the key of the undetermined variable that an exception of GTSAM or IndeterminateError names, or None."""
+    """Return the key of the variable that is not determined, if ``error`` (an exception of GTSAM or IndeterminateError)
+    names it, otherwise None."""
     if isinstance(error, IndeterminateError):
         return error.key
     near = _NEAR.search(str(error))
@@ -91,8 +93,8 @@ def blamed(error: Exception) -> int | None:
 def _solved(
     graph: gtsam.GaussianFactorGraph, keys: Sequence[int], *, robust: bool
 ) -> dict[int, Array] | IndeterminateError:
-    """Return the marginal covariances of the variables ``keys`` of a linear graph, by key. If the graph cannot be
-    solved, the error is returned and not raised. ``robust``: True to use QR instead of Cholesky."""
+    """Return {key: marginal covariance} of the variables ``keys`` of a linear graph. If the graph cannot be solved,
+    return the error instead of raising it. ``robust``: True to use QR instead of Cholesky."""
     order = gtsam.Ordering.OrderingType.COLAMD
     marginals: dict[int, Array] = {}
     try:
@@ -116,8 +118,8 @@ def _solved(
 
 
 def _damped(graph: gtsam.GaussianFactorGraph, sizes: Mapping[int, int], damping: float) -> gtsam.GaussianFactorGraph:
-    """Return the graph with a prior on each variable, whose information is ``damping`` times the diagonal of the
-    graph's information. ``sizes``: the number of components of each variable by key."""
+    """Return the linear ``graph`` with a prior on each variable. The information of a prior is ``damping`` times the
+    diagonal of the graph's information. ``sizes``: the number of components of each variable by key."""
     keys, (_, columns, values) = graph.keyVector(), graph.sparseJacobian_()
     ends = np.cumsum([sizes[key] for key in keys])
     # the last column is the right side of the equations
@@ -153,8 +155,8 @@ class Chained:
         return bool(self._poses)
 
     def begin(self, values: Values) -> State | None:
-        """Return ``values`` by key as a state: poses (N, 3), and all vectors joined to one array (P,). Returns None if
-        P is too large."""
+        """Return ``values``, which are by key, as a state: poses (N, 3), and all vectors joined to one array (P,).
+        Returns None if P is too large for this solver."""
         ends = np.cumsum([0, *(len(values[key]) for key in self._vectors)]).tolist()
         if ends[-1] > MOST_PARAMETERS:
             return None
@@ -166,7 +168,7 @@ class Chained:
         return np.array([values[key] for key in self._poses]), parameters
 
     def values(self, state: State) -> Values:
-        """Return the values of a state from :meth:`begin` by key."""
+        """Return the values of ``state``, which has the form of :meth:`begin`, by key."""
         poses, parameters = state
         vectors = {key: parameters[columns] for key, columns in self._columns.items()}
         return dict(zip(self._poses, poses, strict=True)) | vectors
@@ -186,8 +188,9 @@ class Chained:
         return chain.normal(len(poses), self._first, jacobian, residual)
 
     def moved(self, state: State, damping: float) -> tuple[State, float] | None:
-        """Return the state after a Levenberg-Marquardt step, and the largest component of the step. Returns None if the
-        normal equations are nearly singular. ``damping``: relative to the diagonal of the Hessian."""
+        """Return ``state`` after a Levenberg-Marquardt step, and the step's largest component. ``damping``: this factor
+        times the Hessian's diagonal is added to the Hessian. Returns None if the normal equations are nearly
+        singular."""
         try:
             is_solved, poses, parameters = chain.solved(self.system(state), damping)
         except np.linalg.LinAlgError:
@@ -233,16 +236,15 @@ class Chained:
 
 
 def _kind(factor: Factor, keys: tuple[int, ...]) -> Hashable:
-    """Return a key that groups factors. Factors with equal keys can be linearised together, a factor with the key None
-    alone."""
+    """Return a key that groups factors: factors with equal keys can be linearised together. The key is None for a
+    factor that must be linearised alone. ``keys``: the keys of the factor's variables."""
     kind = cast(Stackable, factor).kind if _is_stackable(type(factor)) else None
     return None if kind is None else (type(factor), kind, *[key for key in keys if not is_pose(key)])
 
 
 @cache
 def _is_stackable(kind: type[Factor]) -> bool:
-    """Return True if factors of a class can be linearised together. The result is cached, because the check takes
-    longer than a linearisation."""
+    """Return True if factors of the class ``kind`` can be linearised together. The result is cached."""
     return hasattr(kind, "kind") and hasattr(kind, "stack")
 
 
@@ -303,7 +305,8 @@ class Problem:
         return chain if chain.fits else None
 
     def solve(self, values: Values, max_iterations: int = MAX_ITERATIONS) -> Solution:
-        """Return a local optimum near the initial ``values``, or the best solution after ``max_iterations``."""
+        """Return a local optimum near the initial ``values``, or the best values after ``max_iterations``, with their
+        cost."""
         chain = self._chain
         begin = None if chain is None else chain.begin(values)
         if chain is not None and begin is not None:
@@ -312,8 +315,8 @@ class Problem:
         return Solution(*descended(self.cost, self._moved, values, max_iterations)[:2])
 
     def _moved(self, values: Values, damping: float) -> tuple[Values, float] | None:
-        """Return the values after a Levenberg-Marquardt step, and the step's largest component. Returns None if the
-        problem is nearly singular. ``damping``: relative to the diagonal of the Hessian."""
+        """Return ``values`` after a Levenberg-Marquardt step, and the step's largest component. ``damping``: this
+        factor times the Hessian's diagonal is added to the Hessian. Returns None if the problem is nearly singular."""
         linear = self.linearize(values)
         curvature = {key: np.full(len(value), LEAST) for key, value in values.items()}
         for i in range(linear.size()):

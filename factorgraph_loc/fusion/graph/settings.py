@@ -22,13 +22,13 @@ class GraphSettings(FileModel):
 
 
 def _lag(value: Any, bounded: ValidatorFunctionWrapHandler) -> Any:
-    """Return infinity for the value "all" of the setting ``lag``, otherwise the value checked by the function
-    ``bounded``."""
+    """Return infinity if the setting ``lag`` has the ``value`` "all". Otherwise return the value checked by the
+    function ``bounded``."""
     return math.inf if value in ("all", math.inf) else bounded(value)
 
 
 def _written(lag: float | None) -> float | str | None:
-    """Return the value of the setting ``lag`` for a file. Infinity is written as ``all``."""
+    """Return the setting ``lag`` as it is written to a file: "all" instead of infinity."""
     return "all" if lag == math.inf else lag
 
 

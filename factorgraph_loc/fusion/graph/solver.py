@@ -52,11 +52,9 @@ FOREVER = 1e300  # s; with this lag only variables with the time minus infinity 
 class FullHistory:
     """An incremental solver that keeps all poses. After a method raises an error of GTSAM, discard the solver.
 
-    ``threshold``: the change of a variable, in m, rad or the units of constants, after which it is linearised again.
-    ``on_failure``: is called with the reason if a factor cannot be linearised. The factor is then left out.
-
-    To read an estimate, iSAM2 solves its whole elimination tree. The variables of the last update are therefore solved
-    separately, at the root of the tree. Updates with points have too many variables for this.
+    ``threshold``: a variable is linearised again after it has changed by this value, in m, rad or the units of
+    constants. ``on_failure``: a function that is called with the reason if a factor cannot be linearised. The factor is
+    then left out.
     """
 
     _solver: gtsam.ISAM2 | gtsam.IncrementalFixedLagSmoother
@@ -90,12 +88,12 @@ class FullHistory:
 
     @property
     def oldest(self) -> int:
-        """The number of the oldest pose that is needed to rebuild the solver after a failure."""
+        """The index of the oldest pose that is needed to rebuild the solver after a failure."""
         return 0
 
     def summary(self, *, failed: bool) -> MarginalSummary | None:
-        """Return the marginal factors that replace the variables removed from the solver, or None if none was removed.
-        ``failed``: True if the last update failed. The factors from before this update are then returned."""
+        """Return the marginal factors that replace the variables removed from the solver. Returns None if no variable
+        was removed. ``failed``: True if the last update failed. The result is then from before this update."""
         return None
 
     def value(self, key: int) -> Array:
@@ -215,9 +213,9 @@ def _holding(factors: Sequence[gtsam.NonlinearFactor], values: Values) -> dict[i
     """Return auxiliary factors that keep iSAM2 from moving the linearisation points of the variables of ``factors``.
 
     Each auxiliary factor connects one of these variables with a new auxiliary variable, and has no information. The
-    auxiliary variable is marginalised immediately. iSAM2 never moves the linearisation point of a variable next to a
-    marginalised one. The keys of the result are the auxiliary variables. ``factors``: marginal factors. ``values``: the
-    values of the variables.
+    auxiliary variable is marginalised immediately, and iSAM2 never moves the linearisation point of its neighbours. The
+    keys of the result are the auxiliary variables. ``factors``: marginal factors. ``values``: of their variables, by
+    key.
     """
     marginal = (factor.keys() for factor in factors if isinstance(factor, gtsam.LinearContainerFactor))
     fixed = dict.fromkeys(key for keys in marginal for key in keys)
@@ -232,9 +230,9 @@ def _holding(factors: Sequence[gtsam.NonlinearFactor], values: Values) -> dict[i
 class LinearFactors:
     """The factors of measurements in a solver, and the linearisation points of the solver's variables.
 
-    ``threshold``: variables that have changed by more are linearised again. ``skip``: the changes are checked at every
-    ``skip``-th update. ``on_failure``: called with the reason if a factor cannot be linearised. This factor is left
-    out.
+    ``threshold``: a variable is linearised again after it has changed by this value. ``skip``: the changes are checked
+    at every ``skip``-th update. ``on_failure``: a function that is called with the reason if a factor cannot be
+    linearised. The factor is then left out.
     """
 
     def __init__(self, threshold: float, skip: int, on_failure: Callable[[str], None]) -> None:
@@ -255,11 +253,11 @@ class LinearFactors:
         nodes: Sequence[Node],
         values: Values,
     ) -> tuple[gtsam.NonlinearFactorGraph, list[int]]:
-        """Prepare an update of the solver. Call :meth:`place` after the update.
+        """Return the factors that the next update of ``solver`` must add, and the indices of the factors that it must
+        remove. Call :meth:`place` after the update.
 
         ``factors``: new factors of GTSAM. ``nodes``: new factors of measurements. ``values``: initial values of new
-        variables by key. Returns a graph of the factors to add, and the indices of the factors to remove from the
-        solver's graph. Factors on variables that will be linearised again are replaced.
+        variables by key. Existing factors on variables that will be linearised again are replaced.
         """
         self._updates += 1
         self._added = self._moved(solver) if self.at and not self._updates % self._skip else []
@@ -287,8 +285,9 @@ class LinearFactors:
         return graph, removed
 
     def _on_held(self, keys: Sequence[int], linearized: gtsam.GaussianFactor) -> gtsam.LinearContainerFactor:
-        """Return the factor ``linearized`` with a Jacobian that agrees with the marginal factors (see the module
-        docstring). ``keys``: the variables of the factor, at least one with a fixed linearisation point."""
+        """Return the factor ``linearized`` with a changed Jacobian, which agrees with the marginal factors (see the
+        module docstring). ``keys``: the variables of the factor. At least one of them has a fixed linearisation
+        point."""
         jacobian, right = linearized.jacobian()
         motions, ends = frame_motions({key: self._held.get(key, self.at[key]) for key in keys})
         if sum(map(is_place, keys)) > 1:  # a factor on one position has absolute information, which must not be removed
@@ -315,8 +314,8 @@ class LinearFactors:
 
     @property
     def framed(self) -> Values:
-        """The linearisation points for a new solver, by key. Variables with marginal factors keep their positions
-        relative to each other."""
+        """The linearisation points for a new solver, by key. Variables of marginal factors keep their relative
+        positions, because marginal factors are valid only for these."""
         return self.at | self._held
 
     @property
@@ -340,8 +339,8 @@ class LinearFactors:
         return list({number: linear for key in anew for number, linear in self._on.get(key, {}).items()}.values())
 
     def _followed(self, estimates: Values) -> list[int]:
-        """Return the keys of the variables with factors that must be linearised again, empty if the map is known.
-        ``estimates``: the present estimates of all variables with a linearisation point that iSAM2 does not move."""
+        """Return the keys of the variables that must be linearised again, none if the map is known. ``estimates``: the
+        current estimates of all variables with a linearisation point that iSAM2 does not move."""
         if all(map(is_pose, estimates)):
             return []
         for key in estimates:

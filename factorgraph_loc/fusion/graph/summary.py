@@ -39,16 +39,15 @@ class MarginalSummary:
     def of(
         cls, graph: gtsam.NonlinearFactorGraph, points: gtsam.Values, at: Values, ours: Collection[int] = ()
     ) -> MarginalSummary:
-        """Return the marginal factors and priors in a solver's ``graph``.
-
-        ``points``: the linearisation points of iSAM2. ``at``: the linearisation points of the result. ``ours``: the
-        indices of the factors of measurements in ``graph``, which are left out.
-        """
+        """Return the marginal factors and priors in a solver's ``graph``. ``points``: the linearisation points of
+        iSAM2. ``at``: the linearisation points of the result. ``ours``: the indices in ``graph`` of the factors of
+        measurements, which are left out."""
         every = (graph.at(i) for i in range(graph.size()) if i not in ours)
         values = to_gtsam(at)
 
         def placed(factor: gtsam.LinearContainerFactor) -> gtsam.LinearContainerFactor:
-            """Return a marginal factor with the linearisation points ``at`` instead of those of iSAM2."""
+            """Return the marginal factor ``factor``, linearised at ``at`` instead of the linearisation points of
+            iSAM2."""
             return gtsam.LinearContainerFactor(
                 gtsam.LinearContainerFactor(factor.factor(), points).linearize(values), values
             )
@@ -60,12 +59,12 @@ class MarginalSummary:
 
     @property
     def oldest(self) -> int:
-        """The index of the oldest pose."""
+        """The index of the oldest pose among the variables."""
         return oldest_pose(self.keys)
 
     def before_pose(self, pose: int) -> MarginalSummary:
-        """Return the summary with the pose of index ``pose`` and later poses marginalised out. Call this before their
-        keys are used for new poses."""
+        """Return the summary of only the poses with an index below ``pose`` and of all other variables. Later poses are
+        marginalised out. Call this before their keys are used for new poses."""
         kept = frozenset(key for key in self.keys if not is_of_keyframe(key) or index_of(key) < pose)
         return MarginalSummary(tuple(self.on(kept)), kept, {key: self.at[key] for key in kept})
 
