@@ -102,8 +102,8 @@ class NewVariable:
 
     ``mean`` (d,): the initial estimate. ``by_pose`` (d, 3): its Jacobian by the body-frame perturbation of the pose.
     ``by_block``: its Jacobian (d, P) by each other block, by name. ``noise`` (d, d): its covariance if the pose and
-    these blocks were exact. ``sightings``: pairs of a time [s] and an observation from which ``mean`` is computed. If
-    empty, ``mean`` and ``noise`` are a prior.
+    these blocks were exact. ``sightings``: pairs (time [s], observation) that determine ``mean``. If empty, ``mean``
+    and ``noise`` are a prior.
     """
 
     name: str

@@ -176,8 +176,8 @@ class ConstantsCalibrator(Calibrator):
         return parts, settings
 
     def finished(self, _parts: Sequence[Any], _rig: Rig, knowledge: SensorKnowledge) -> SensorKnowledge:
-        """Return the result of the calibration: ``knowledge``, the fitted constants, to which subclasses add noise or
-        plots. ``_parts``: the result of :meth:`part` for each log. ``_rig``: the rig with the fitted constants."""
+        """Return the result of the calibration. Subclasses add noise or plots to ``knowledge``, the fitted constants.
+        ``_parts``: the result of :meth:`part` for each log. ``_rig``: the rig with the fitted constants."""
         return knowledge
 
     def learn(

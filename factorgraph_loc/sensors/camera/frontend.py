@@ -164,7 +164,8 @@ def _extractor(settings: FrontendSettings) -> Extractor:
 
 
 def _empty_features(settings: FrontendSettings) -> ImageFeatures:
-    """Return features of length 0, for an image that cannot be used. Their type is that of detected features."""
+    """Return features of length 0, to represent an image that cannot be used. Their type is that of detected
+    features."""
     return decode(encode(*_extractor(settings).detectAndCompute(np.zeros((16, 16), dtype=np.uint8))))
 
 

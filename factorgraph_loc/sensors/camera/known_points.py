@@ -204,8 +204,8 @@ class KnownPoints:
         return ReprojectionFactor(model, self.map.positions[points], pixels, point_covariances=covariances)
 
     def _empty_factor(self, m: CameraFrame) -> ReprojectionFactor | None:
-        """Return a factor without points, to which the caller adds matched points. Returns None if the features in
-        ``m`` cannot be matched, for example because the map has features of another kind."""
+        """Return a factor without points. The caller then adds matched points. Returns None if the features in ``m``
+        cannot be matched, for example because the map has features of another kind."""
         self.names = ()
         if self.associator is None:
             if not self._others_matter:

@@ -174,7 +174,7 @@ class SightingWindow:
         The method is ``iterations`` steps of Gauss-Newton from ``pose`` (3,). The path since the sightings is
         marginalised. Let e be the residuals, whitened by the sensor noise, J their Jacobian by the path, and C the
         covariance of the path. The covariance of e is R = I + J C J'. The residuals on the most likely path are R^-1 e.
-        ``whitener``: the result of :meth:`whitener`, for the initial robust weights.
+        ``whitener``: the result of :meth:`whitener`. It determines the initial robust weights.
         """
         covariances = self._covariance
         if self._start is not None:  # the known start becomes the first row, without robust loss

@@ -120,8 +120,8 @@ class NoiseFit:
     """The estimated noise of the odometry.
 
     ``growth``: the noise of each error, by name ("along", "lateral", "heading"). ``outliers``: the fraction of windows
-    that are outliers. ``widened``: the factor by which ``growth`` was multiplied to explain the errors in long windows.
-    ``floored``: names of the errors with noise that was raised to its lower bound.
+    that are outliers. ``widened``: a factor, already included in ``growth``, that explains larger errors in long
+    windows. ``floored``: names of the errors with noise that was raised to its lower bound.
     """
 
     growth: Mapping[str, Growth]

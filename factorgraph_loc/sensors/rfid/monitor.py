@@ -173,8 +173,8 @@ def _count(
 
 @compiled
 def _taken(cells: Array, tags: Integers) -> tuple[float, float]:
-    """Return the sum of squared differences of observed and expected reads, and the sum of their variances, for the
-    indices ``tags``. Also set their elements of ``cells``, the table of :func:`_count`, to zero."""
+    """Return the sum of squared differences of observed and expected reads of ``tags`` (indices), and the sum of their
+    variances. Also set the elements of these tags in ``cells``, the table of :func:`_count`, to zero."""
     squares = variances = 0.0
     for t in tags:
         for a in range(cells.shape[2]):

@@ -228,8 +228,8 @@ def estimate_geometry(
 def with_changes(
     settings: RfidSettings, survey: SurveySettings, places: Sequence[Parameter], changes: Array
 ) -> tuple[RfidSettings, SurveySettings]:
-    """Return copies of ``settings`` and ``survey`` to which ``changes`` (P,) are added. ``places``: the P parameters
-    that change, from :func:`geometry_parameters`."""
+    """Return copies of ``settings`` and ``survey`` with the ``changes`` (P,) added. ``places``: the P parameters that
+    change, from :func:`geometry_parameters`."""
     antennas = dict(settings.all_antennas())
     for place, change in zip(places, changes.tolist(), strict=True):
         antenna, name = kind_of(place)[1], place.name.rpartition(".")[2]
