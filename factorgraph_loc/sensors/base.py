@@ -204,9 +204,9 @@ class View(Protocol):
 
 
 class Finder(Protocol):
-    """Global localization by one sensor: finds the pose without a prior, at the start or after the robot was carried.
-    ``start``: the known start position, or None. With it, only the heading is sought. ``at_once``: True if a single
-    measurement can determine the pose."""
+    """Global localization by one sensor: finds the pose without a prior, as a run begins or after the robot was
+    carried. ``start``: the known start position, or None. With it, only the heading is sought. ``at_once``: True if a
+    single measurement can determine the pose."""
 
     start: KnownPosition | None
 

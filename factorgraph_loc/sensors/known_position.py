@@ -37,7 +37,8 @@ class KnownPosition:
         return self.motion.state(self.t) if self._odometry is None else self._odometry
 
     def settle(self) -> None:
-        """Store the odometry state at the start, so that it no longer changes. Call this at the first measurement."""
+        """Store the odometry state at the time of the prior, so that it no longer changes. Call this at the first
+        measurement."""
         self._odometry = self.odometry
 
     @property
@@ -45,7 +46,8 @@ class KnownPosition:
         return self.prior.t
 
     def facing(self, heading: float) -> PosePrior:
-        """Return the start as a Gaussian prior with mean ``heading`` [rad] and standard deviation pi of the heading."""
+        """Return a Gaussian prior of the start pose, with mean ``heading`` [rad] and standard deviation pi of the
+        heading."""
         covariance = self.prior.covariance.copy()
         covariance[2, 2] = math.pi**2
         return PosePrior(self.t, np.append(self.prior.pose[:2], heading), covariance)
@@ -59,7 +61,8 @@ class KnownPosition:
         return Mode(1.0, np.append(self.prior.pose[:2], turned), covariance)
 
     def candidates(self, now: ChainState) -> Array:
-        """Return possible poses (N, 3) at the odometry state ``now``, from N evenly spaced headings at the start."""
+        """Return possible poses (N, 3) at the odometry state ``now``, one for each of N evenly spaced headings of the
+        start."""
         headings = np.arange(HEADINGS) * 2.0 * math.pi / HEADINGS
         starts = np.column_stack((np.tile(self.prior.pose[:2], (HEADINGS, 1)), headings))
         return se2.compose(starts, self.motion.relative(self.odometry, now).delta)

@@ -163,8 +163,8 @@ def odometry_of(log: Log) -> VelocityStream | IncrementStream:
 
 
 def overlap(log: Log) -> tuple[float, float]:
-    """Return the start and the end [s] of the time in a log with both odometry and a reference trajectory. The start is
-    after the end if the log has no such time."""
+    """Return the first and the last time [s] of a log with both odometry and a reference trajectory. The first time is
+    after the last one if the log has no such time."""
     assert log.reference is not None
     t = odometry_of(log).t + log.rig.time_offset("odometry")
     return max(float(t[0]), float(log.reference.t[0])), min(float(t[-1]), float(log.reference.t[-1]))

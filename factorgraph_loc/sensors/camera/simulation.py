@@ -30,7 +30,7 @@ def simulate(ride: Ride) -> Simulated:
 
 
 def looks(settings: Any) -> dict[str, float]:
-    """Return {"points": N}, where N is the maximum number of simulated detections per second. ``settings``: those of
+    """Return {"points": N}, where N is the maximum number of simulated detections per second. ``settings``: settings of
     the simulation. Raises ValueError if the world has points, but the rig has no camera."""
     if settings.world.points and settings.rig.find(CameraSettings) is None:
         raise ValueError("the world has points, expected a rig with a camera")

@@ -125,7 +125,8 @@ def prepare(use: Use, progress: Callable[[float], None]) -> PreparedLog:
 
 
 def _without_features(log: Log, stream: ImageStream, estimator: str) -> PreparedLog:
-    """Return the log with an empty list of features for each image, and a warning that ``estimator`` ignores images."""
+    """Return the log with an empty list of features for each image, and a warning that ``estimator`` ignores images.
+    ``stream``: the images of the log."""
     nothing = CameraFrame(0.0, "", np.empty((0, 2)), np.empty((0, 0), dtype=np.uint8), np.empty(0, dtype=np.int64))
     frames = FeatureStream(stream.t, [nothing] * len(stream.t))
     sentence = "{log}: {estimator} does not use images: all {images} are ignored"

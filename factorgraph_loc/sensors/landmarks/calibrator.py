@@ -205,7 +205,8 @@ class LandmarkCalibrator(ConstantsCalibrator):
 
     def finished(self, parts: Sequence[Sightings], rig: Rig, knowledge: SensorKnowledge) -> SensorKnowledge:
         """Return ``knowledge``, the fitted constants, with enlarged noise, because the errors in a time window are
-        correlated. See :func:`pose_share`. ``rig``: the rig with these constants."""
+        correlated. ``parts``: the sightings of each log. ``rig``: the rig with the fitted constants. See
+        :func:`pose_share`."""
         scatter: BearingRangeSettings = rig.bearing_range
         factor = pose_share(parts, scatter) ** -0.5
         wider = {name: factor * getattr(scatter, name) for name in SIGMAS}

@@ -124,7 +124,7 @@ class KnownLandmarks:
         return factor, *single_factors
 
     def _usable(self, m: BearingRange) -> tuple[list[int], list[int], list[int], list[int]]:
-        """Return four lists: the row numbers of the landmarks in ``m`` for each group of :meth:`factors`. Other rows
+        """Return four lists: the row indices of the landmarks in ``m`` for each group of :meth:`factors`. Other rows
         are counted in the diagnostics."""
         fixed, single, surveyed, unknown = list[int](), list[int](), list[int](), list[int]()
         rows = zip(m.landmarks, m.range.tolist(), m.bearing.tolist(), strict=True)

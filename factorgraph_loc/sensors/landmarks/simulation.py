@@ -41,8 +41,8 @@ def simulate(ride: Ride) -> Simulated:
 
 
 def looks(settings: Any) -> dict[str, float]:
-    """Return {"landmarks": N}, where N is the maximum number of simulated sightings per second. ``settings``: those of
-    the simulation. Raises ValueError if the world has landmarks, but the rig has no landmark sensor."""
+    """Return {"landmarks": N}, where N is the maximum number of simulated sightings per second. ``settings``: settings
+    of the simulation. Raises ValueError if the world has landmarks, but the rig has no landmark sensor."""
     if settings.world.landmarks and settings.rig.find(BearingRangeSettings) is None:
         raise ValueError("the world has landmarks, expected a rig with a section [bearing_range]")
     return {"landmarks": settings.sightings.rate * settings.world.landmarks}
@@ -116,7 +116,7 @@ class SimulatedSightings:
 
 def on_robot(world: World, rig: Rig, settings: Any, rng: np.random.Generator) -> SimulatedSightings | None:
     """Return the simulated landmark sensor of a rig, or None if the rig lacks one or the world has no landmarks.
-    ``settings``: those of the simulation. ``rng``: draws the noise."""
+    ``settings``: settings of the simulation. ``rng``: draws the noise."""
     if rig.find(BearingRangeSettings) is None or not world.landmarks:
         return None
     return SimulatedSightings(rig.of(BearingRangeSettings).model(), world, settings.sightings, rng)

@@ -111,8 +111,9 @@ class Loops:
 
 @dataclass(frozen=True)
 class LoopStream(ScanStream):
-    """All loop closures of a log, one per row. The fields are those of :class:`Loops`. Rows with the same timestamp
-    form one measurement."""
+    """All N loop closures of a log, one per row. Rows with the same timestamp form one measurement. ``age`` (N,): the
+    time [s] since the earlier pose. ``x``, ``y`` (N,) [m], ``heading`` (N,) [rad]: the pose in the frame of the earlier
+    pose, NaN if unknown. ``score`` (N,): confidence from 0 to 1, NaN if unknown."""
 
     kind: ClassVar[type[Any]] = Loops
     age: Array

@@ -53,8 +53,8 @@ class LoopSensor(Sensor):
             yield Link(m.t, earlier.t, factor, factor.rows)
 
     def at_end(self, factor: Factor, width: float) -> Factor:
-        """Return a copy of ``factor`` for the solution of the whole graph after a run. ``width``: the scale of the
-        copy's robust loss is multiplied by it."""
+        """Return a copy of ``factor`` with the scale of its robust loss multiplied by ``width``. The copy is used when
+        the whole graph is solved after a run."""
         return cast(LoopFactor, factor).widened(width)
 
     def convex_width(self, factor: Factor, values: Sequence[Array]) -> float:

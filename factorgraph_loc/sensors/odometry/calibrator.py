@@ -74,8 +74,8 @@ class Windows:
         return self.begin
 
     def states(self, model: OdometryModel) -> tuple[Array, Array]:
-        """Return the odometry states (M, 8) at the start and (M, 8) at the end of each window. The columns are those of
-        :class:`factors.motion.ChainState`."""
+        """Return the odometry states (M, 8) at the start and (M, 8) at the end of each window. The columns are the
+        fields of :class:`factors.motion.ChainState`: time, x, y, heading, path, turn, unknown and still."""
         chain = integrated(self.log, model)
         return chain.states(self.begin), chain.states(self.end)
 
@@ -176,8 +176,8 @@ def _noise_factor(logs: Sequence[Log], model: OdometryModel) -> float:
 
 def _unit_covariances(windows: Windows, model: OdometryModel) -> Array:
     """Return the covariances (M, 11, 3, 3) of the errors in each window if one of 11 variances is 1 and all others 0.
-    Nine variances are those of longitudinal, lateral and heading errors, each per distance, rotation and time. Two are
-    those of position and heading of the reference."""
+    The first nine are the variances of longitudinal, lateral and heading errors, each per distance, rotation and time.
+    The last two are the variances of position and heading of the reference."""
     start, end = windows.states(model)
     drivers = np.abs(end - start)[:, [4, 5, 0]]  # distance, rotation, time in motion
     drivers[:, 2] -= end[:, 7] - start[:, 7]
@@ -228,8 +228,8 @@ class OdometryCalibrator(ConstantsCalibrator):
     def learn(
         self, traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path | None, like: SensorKnowledge | None = None
     ) -> SensorKnowledge:
-        """Return constants and noise of the odometry. It is an empty :class:`SensorKnowledge` if the reference has no
-        headings. For the arguments see :meth:`Calibrator.learn`."""
+        """Return constants and noise of the odometry, estimated from the logs ``traced``. The result is an empty
+        :class:`SensorKnowledge` if the reference has no headings. For other arguments see :meth:`Calibrator.learn`."""
         reference = traced[0].log.reference
         has_heading = reference is not None and reference.has_heading
         return super().learn(traced, rig, first, grids, like) if has_heading else SensorKnowledge()
@@ -281,7 +281,7 @@ class OdometryCalibrator(ConstantsCalibrator):
 
     def finished(self, parts: Sequence[Windows], rig: Rig, knowledge: SensorKnowledge) -> SensorKnowledge:
         """Return ``knowledge``, the fitted constants, with the noise of the calibrated odometry, warnings and
-        residuals. ``rig``: the rig with these constants."""
+        residuals. ``parts``: the windows of each log. ``rig``: the rig with the fitted constants."""
         noise = fit_noise([part.log for part in parts], odometry_model(rig))
         growth = {error: GrowthSettings.bounded(**asdict(g)) for error, g in noise.growth.items()}
         settings = rig.odometry.model_copy(update={"noise": OdometryNoise(**growth)})
@@ -301,7 +301,8 @@ class OdometryCalibrator(ConstantsCalibrator):
 
 
 def _residuals(windows: Windows, model: OdometryModel) -> Residuals:
-    """Return the errors of the odometry in each window, for plots."""
+    """Return the errors of the odometry in each window, for plots. ``model``: the odometry model with fitted
+    constants."""
     start, end = windows.states(model)
     sigmas = np.sqrt(np.diagonal(windows.covariances(model), axis1=1, axis2=2))
     return Residuals(windows.log.name, ERRORS, windows.t, end[:, 4] - start[:, 4], windows.errors(model), sigmas)

@@ -98,7 +98,9 @@ class VelocityStream(Stream):
 
 @dataclass(frozen=True)
 class IncrementStream(Stream):
-    """All odometry increments of a log. For the fields, each (N,), see :class:`IncrementOdometry`."""
+    """All N odometry increments of a log. ``dx``, ``dy`` (N,) [m], ``dtheta`` (N,) [rad]: the motion since the previous
+    row, in the robot frame at that row. ``unknown`` (N,) [s]: the time without measured motion since the previous
+    row."""
 
     rank: ClassVar[int] = FLOOR
     kind: ClassVar[type[Any]] = IncrementOdometry

@@ -44,9 +44,8 @@ class Row(NamedTuple):
 
 class PositionFinder:
     """Global localization by measured positions. It implements :class:`~factorgraph_loc.sensors.base.Finder`.
-
-    ``observation``: a function from a measurement to its observation, which depends on the pose at the same time.
-    """
+    ``observation``: a function that returns the observation of a measurement, as a constraint on the pose at its
+    time."""
 
     at_once = False
 

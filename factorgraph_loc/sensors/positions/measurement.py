@@ -93,7 +93,8 @@ class Position:
 
 @dataclass(frozen=True)
 class PositionStream(Stream):
-    """All measured positions of a log. For the fields, each (N,), see :class:`Position`."""
+    """All N measured positions of a log. ``x``, ``y`` (N,) [m]: positions in the world frame. ``var_x``, ``cov_xy``,
+    ``var_y`` (N,) [m^2]: the elements of their covariances, NaN if unknown."""
 
     kind: ClassVar[type[Any]] = Position
     x: Array

@@ -186,7 +186,8 @@ class TagSensor(Sensor):
 
     def _detection(self, m: RfidScan, moved: TagReadCounts, counts: TagReadCounts) -> TagObservation:
         """Return the observation of reads and misses of the scan ``m``. ``counts``: the reads and misses, relative to
-        the pose at the scan. ``moved``: the same, relative to the pose that the observation must depend on."""
+        the pose at the scan. ``moved``: these reads and misses, relative to the pose that the observation must depend
+        on."""
         factor = RfidFactor(self.tags.likelihood, moved, self.constants.indices)
         return TagObservation(m.t, factor, int(counts.hits.sum()), counts, len(m.antennas), self._blocks)
 

@@ -282,7 +282,7 @@ def simulate(ride: Ride) -> Simulated:
 
 
 def looks(settings: Any) -> dict[str, float]:
-    """Return {"tags": N}, where N is rounds per second times antennas times tags. ``settings``: those of the
+    """Return {"tags": N}, where N is rounds per second times antennas times tags. ``settings``: settings of the
     simulation. Raises ValueError if rig and world do not fit together, or if a fault names an unknown antenna."""
     if settings.rig.find(RfidSettings) is None:
         raise ValueError("the rig has no section [rfid], expected one with antennas")
@@ -339,7 +339,7 @@ class SimulatedReader:
 
 
 def on_robot(world: World, rig: Rig, settings: Any, rng: np.random.Generator) -> SimulatedReader:
-    """Return the simulated reader of a rig for active localization. ``settings``: those of the simulation. Raises
+    """Return the simulated reader of a rig for active localization. ``settings``: settings of the simulation. Raises
     InputError if they have faults, or if the antennas are fixed in the building, because this is not supported."""
     if is_fixed(rig):
         raise InputError(f"{settings.name}: has antennas in the map, expected antennas on the robot for active runs")

@@ -61,9 +61,9 @@ class RfidSummary:
     """A summary of all RFID reads of a log.
 
     ``reads``, ``scans``, ``rounds``: the numbers of reads, scans and rounds. ``antennas``: the summaries of antennas by
-    name. ``known``: the number of tags of the map that are read. ``unread``: the other tags of the map. ``unknown``:
-    the number of reads of each EPC that is not in the map. ``late``: the number of rounds with an earlier timestamp
-    than a previous round, and the largest such difference [s].
+    name. ``known``: the number of tags of the map that are read. ``unread``: the tags of the map that are never read.
+    ``unknown``: the number of reads of each EPC that is not in the map. ``late``: the number of rounds with an earlier
+    timestamp than a previous round, and the largest such difference [s].
     """
 
     reads: int

@@ -40,9 +40,9 @@ def rounds_from_inventories(
 ) -> Integers:
     """Return the index (N,) of the inventory round of each of N reads, :data:`OUTSIDE` for reads in no round.
 
-    ``t_ns`` (N,), ``antenna`` (N): time [ns] and antenna of each read. ``end_ns``, ``duration_ns`` (R,): end and
-    duration [ns] of R rounds. ``inventory_antenna`` (R): their antennas. A round contains the reads of its antenna from
-    its beginning to its end, inclusive. A read on the border of two rounds belongs to the earlier one.
+    ``t_ns`` (N,), ``antenna`` (N): time [ns] and antenna of each read. ``end_ns``, ``duration_ns`` (R,),
+    ``inventory_antenna`` (R): end [ns], duration [ns] and antenna of R rounds. A round contains the reads of its
+    antenna from its beginning to its end, inclusive. A read on the border of two rounds belongs to the earlier one.
     """
     names, listening = np.asarray(antenna, dtype=str), np.asarray(inventory_antenna, dtype=str)
     out = np.full(len(t_ns), OUTSIDE, dtype=np.int64)
@@ -140,7 +140,8 @@ def read_rounds(
 
 
 def _from_inventories(reads: TableRows | None, inventories: TableRows, warnings: list[Notice]) -> ReadsByRound:
-    """Return the reads, assigned to the rounds in the table ``inventories``. See :func:`read_rounds`."""
+    """Return the reads, assigned to the rounds in the table ``inventories``. A warning about reads outside of all
+    rounds is appended to ``warnings``."""
     end_ns, antenna = inventories.t_ns, inventories.names["antenna"]
     duration = inventories.numbers["duration"]
     # timestamps may decrease, because the clock of a reader may jump; estimators drop late scans
@@ -164,7 +165,8 @@ def _from_inventories(reads: TableRows | None, inventories: TableRows, warnings:
 
 
 def _require_all(inventories: TableRows) -> None:
-    """Raise InputError if rows of ``inventories`` were skipped or sorted. Reads refer to these rows by number."""
+    """Raise InputError if rows of ``inventories`` were skipped or sorted, because reads refer to these rows by
+    number."""
     first, rows = int(inventories.rows.min(initial=2)), inventories.rows
     if first > 2 or np.any(rows != np.arange(first, first + len(rows))):
         raise InputError(

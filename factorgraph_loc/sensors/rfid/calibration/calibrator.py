@@ -60,7 +60,8 @@ class RfidCalibrator(Calibrator):
         return learn_rfid(logs, rig, grids, None if known is None else known.kind)
 
     def with_priors(self, rig: Rig, first: Rig) -> Rig:
-        """Return ``rig`` with the priors of the detection models in ``first``. See :meth:`Calibrator.with_priors`."""
+        """Return ``rig`` with the priors of the detection models in ``first``. Use this if smoothing and calibration
+        alternate, see :meth:`Calibrator.with_priors`."""
         if rig.rfid is None or first.rfid is None:
             return rig
         priors: dict[str, PriorSettings] = {name: model.prior for name, model in first.rfid.models.items()}

@@ -194,8 +194,8 @@ def _refitted(
     pairs: TagPairs, initial: DetectionModel, name: str, floor: Floor
 ) -> tuple[DetectionModel, list[FittedConstant]] | None:
     """Return a detection model of the same kind as ``initial``, fitted to ``pairs``, and its parameters. Returns None
-    for a beam model that ``pairs`` do not determine. ``name``: the name of the model. ``floor``: minimum
-    probabilities."""
+    for a beam model that ``pairs`` do not determine. ``name``: the name of the model. ``floor``: minimum probabilities
+    of a read and of a miss."""
     family = family_of(initial, pairs)
     model, posterior = fit_model(pairs, family, floor)
     if isinstance(initial, BeamModel) and np.any(posterior.errors > VAGUE * np.abs(posterior.values)):

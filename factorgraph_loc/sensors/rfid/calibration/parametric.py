@@ -47,8 +47,9 @@ class Family:
     """A family of detection models with P parameters.
 
     ``parameters``: the P parameters with priors. ``built``: a function from values (P,) of the parameters to the model.
-    ``design``: a function from points (M, 3) and facings (M,) to the derivatives (M, P) of the logit of a read by the
-    parameters. It is None if the logit is not linear in the parameters. For points and facings see :class:`TagPairs`.
+    ``design``: a function from points (M, 3) and facings (M,) of tags to the derivatives (M, P) of the logit of a read
+    by the parameters. It is None if the logit is not linear in the parameters. Points and facings are those of
+    :meth:`jacobian`.
     """
 
     parameters: tuple[Parameter, ...]
@@ -109,8 +110,8 @@ def beam(start: BeamModel) -> Family:
 
 
 def scaled(start: GridModel) -> Family:
-    """Return the family of grids that differ from ``start`` only in range and read rate. The parameters are those of
-    :mod:`factors.rfid.parameters`."""
+    """Return the family of grids that differ from ``start`` only in range and read rate. Its two parameters are changes
+    of range and read rate, defined in :mod:`factors.rfid.parameters`."""
     peak = min(start.peak, MOST_CERTAIN)
 
     def built(values: Array) -> GridModel:

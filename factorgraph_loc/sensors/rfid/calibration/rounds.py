@@ -90,8 +90,8 @@ def rounds_of(log: Log, settings: RfidSettings, *, merged: bool = True) -> Round
 
 def _middle(age: Array, inverse: Integers, read: NDArray[np.bool_], count: int) -> Array:
     """Return the age (R,) [s] of the middle of the reads of R = ``count`` rounds, relative to the end of each round. A
-    round without reads gets the median age. ``age`` (N,): age [s] of each row, see :class:`RfidStream`. ``inverse``
-    (N,): the round of each row. ``read`` (N,): True for rows with a read."""
+    round without reads gets the median age. ``age`` (N,): time [s] from each row to the end of its round. ``inverse``
+    (N,): the round index of each row. ``read`` (N,): True for rows with a read."""
     oldest, youngest = np.full(count, -np.inf), np.full(count, np.inf)
     np.maximum.at(oldest, inverse[read], age[read])
     np.minimum.at(youngest, inverse[read], age[read])
