@@ -70,9 +70,7 @@ class Track:
     @classmethod
     def read(cls, files: ResultFiles, max_gap: float = MAX_GAP) -> Track:
         """Return the plotted data of a run from its result files. ``reliability`` is empty: no file contains it.
-
-        ``max_gap`` [s]: errors are not interpolated across longer gaps between estimates.
-        """
+        ``max_gap`` [s]: errors are not interpolated across longer gaps between estimates."""
         causal, final = (estimates.trajectory for estimates in files.estimates().values())
         return cls(causal if len(causal) else None, final, files.innovations(), files.events(), max_gap)
 
@@ -87,7 +85,7 @@ def write_picture(figure: Figure, path: Path) -> None:
 
 
 def mark_events(axis: Axes, events: Sequence[tuple[float, str]]) -> None:
-    """Mark the times of ``events``, pairs of a time [s] and a description, by dashed vertical lines."""
+    """Draw a dashed vertical line at the time of each of ``events``, pairs of a time [s] and a description."""
     for i, (t, _) in enumerate(events):
         label = "event (see events.csv)" if i == 0 else None
         axis.axvline(t, color=COLOURS[3], linestyle="--", linewidth=1.0, label=label, zorder=1.5)
@@ -184,8 +182,8 @@ def _nis(axis: Axes, sensor: str, rows: Array) -> None:
 
 
 def _draw(axis: Axes, t: Array, single: Array, mean: tuple[Array, Array], low: float) -> None:
-    """Draw ``single`` values (N,) at the times ``t`` (N,), and their running ``mean`` (times, values). The y axis
-    starts at ``low`` / 4."""
+    """Draw single values and their running mean over time. ``t`` (N,): times [s]. ``single`` (N,): the values at these
+    times. ``mean``: the times and the values of the running mean. The y axis starts at ``low`` / 4."""
     axis.plot(t, single, ".", color="0.6", markersize=2.5, label="single values", zorder=2)
     axis.plot(*mean, color=COLOURS[1], linewidth=2.0, label=f"mean over {WINDOW:g} s", zorder=3)
     # the smallest values are not in the range of the axis

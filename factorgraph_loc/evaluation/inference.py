@@ -108,8 +108,9 @@ def contrast(
     """Return the difference between the scores ``a`` and ``b`` of two methods, {log: {seed: score}}.
 
     Only common logs and seeds are compared. If a method ran with a single seed, its run is paired with each seed of the
-    other method. ``rms``, ``alike``: see :func:`pooled`. ``interval``: whether to compute the interval, which takes
-    time. Returns None without common runs.
+    other method. ``rms``: whether to pool by the root mean square instead of the mean. ``alike``: {log: name of its
+    group}; all logs of a group count as one. ``interval``: whether to compute the interval, which takes time. Returns
+    None without common runs.
     """
     matched = {log: pair_seeds(a[log], b[log]) for log in a if log in b}
     left_out = sum(missing for _, missing in matched.values()) + sum(len(b[log]) for log in b if log not in a)
@@ -176,9 +177,10 @@ def differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def signed_rank(differences: Array) -> float:
-    """Return the two-sided p value of Wilcoxon's signed-rank test that ``differences`` (N,) are symmetric about 0.
+    """Return the two-sided p value of Wilcoxon's signed-rank test. The hypothesis is that ``differences`` (N,) are
+    symmetric about 0.
 
-    It is exact for at most 60 differences that are not 0. Above, the normal approximation is used.
+    The p value is exact for at most 60 differences that are not 0. For more, the normal approximation is used.
     """
     ranks = _ranks(differences)
     doubled = np.rint(2.0 * ranks[differences != 0.0]).astype(
@@ -263,8 +265,9 @@ def _ranks(differences: Array) -> Array:
 
 
 def _clusters(scores: Mapping[str, Array], alike: Mapping[str, str] | None) -> list[Array]:
-    """Return an array (K, C) for each log with scores: C scores of K runs. ``alike``: {log: name of its group}, or
-    None. Logs of one group share an array."""
+    """Return arrays (K, C) of the scores of K runs with C compared methods, one for each log or group of logs.
+    ``scores``: by log, such an array. ``alike``: {log: name of its group}, or None for no groups. Logs of one group
+    share an array."""
     merged: dict[str, list[Array]] = {}
     for log, values in scores.items():
         if len(values):

@@ -91,8 +91,8 @@ def pauses(t: Array) -> Integers:
 
 
 def _within(t: Array, stamps: Array) -> Array:
-    """Return times ``t`` (M,) clipped to the range of ``stamps`` (N,). A time that is outside by more than
-    :data:`TOLERANCE` becomes NaN."""
+    """Return the times ``t`` (M,) clipped to the range of the timestamps ``stamps`` (N,). A time that is outside by
+    more than :data:`TOLERANCE` becomes NaN."""
     if not len(stamps):
         return np.full(len(t), np.nan)
     clipped = np.clip(t, stamps[0], stamps[-1])

@@ -11,7 +11,8 @@ Row = Mapping[str, Any]  # a run: its log, estimator, seed, status and scores
 
 
 def row_of(scores: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the scores of a run as cells of a table. Lists are omitted, but the warnings become one text."""
+    """Return the ``scores`` of a run for a row of a table. Lists are omitted, but the warnings are joined to one
+    text."""
     cells = {name: value for name, value in scores.items() if not isinstance(value, list)}
     return cells | {WARNINGS: "\n".join(map(str, scores.get(WARNINGS, ()))) or None}
 

@@ -81,7 +81,8 @@ class Executor(AbstractContextManager[Any], Protocol):
 
 
 class _Queue:
-    """The runs to compute. ``later``: (time of the next attempt, run) for runs that another process has claimed."""
+    """The runs to compute. ``later``: pairs (time of the next attempt [s], run), for runs that another process computes
+    now."""
 
     def __init__(self, runs: Sequence[Planned]) -> None:
         self._runs: dict[Hashable, list[Planned]] = {}
@@ -193,14 +194,16 @@ def _forget_peak_memory() -> None:
 
 @dataclass(eq=False)
 class _Worker(Worker):
-    """A worker process. ``source``: source of its last run, which is in memory. ``since`` [s]: start of this run."""
+    """A worker process. ``source``: source of the data of its last run, which are in memory. ``since`` [s]: start of
+    this run."""
 
     source: Hashable = None
     since: float = 0.0
 
 
 class Processes(Executor):
-    """Computes runs in at most ``jobs`` local processes. Raises ProcessDiedError if no process can be started."""
+    """Computes runs in at most ``jobs`` local processes. ``limits``: memory and time of each run. Raises
+    ProcessDiedError if no process can be started."""
 
     def __init__(self, jobs: int, limits: Limits) -> None:
         self._jobs, self._time = jobs, limits.time

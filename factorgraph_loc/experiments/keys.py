@@ -62,7 +62,7 @@ def digest_of_code(root: Path) -> str:
 
 @lru_cache
 def library_versions() -> dict[str, str]:
-    """Return the versions of the numerical libraries and of Python, by name."""
+    """Return {name: version} of the numerical libraries and of Python."""
     return {name: importlib.metadata.version(name) for name in LIBRARIES} | {"python": platform.python_version()}
 
 
@@ -109,7 +109,8 @@ class LogFacts:
 
 @dataclass(frozen=True)
 class EstimatorFacts:
-    """Properties of an estimator. ``effective``: all its settings. ``deterministic``: if it uses no random numbers."""
+    """Properties of an estimator. ``effective``: all its settings with defaults, {key: value}. ``deterministic``: True
+    if it uses no random numbers."""
 
     effective: Mapping[str, Any]
     deterministic: bool

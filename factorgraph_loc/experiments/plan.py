@@ -179,8 +179,9 @@ def _check_count(count: int, experiment: Experiment) -> None:
 
 
 def _by_simulation(sweep: Sweep, entry: EstimatorEntry) -> dict[tuple[Any, ...], list[dict[str, Scalar]]]:
-    """Return the combinations of swept settings of an estimator and of the simulation, by values of the latter. A key
-    is the tuple of the values of the swept settings of the simulation."""
+    """Return the combinations of swept settings of an estimator and of the simulation, grouped by the settings of the
+    simulation. The result is {values of the swept settings of the simulation: combinations}. A combination is {dotted
+    name: value}."""
     points: dict[tuple[Any, ...], list[dict[str, Scalar]]] = {}
     for swept in sweep.points(SIMULATION, entry.shown, entry.name):
         points.setdefault(tuple(_part(swept, (SIMULATION,)).values()), []).append(swept)

@@ -93,7 +93,7 @@ def _covariance(position_sigma: float, heading_sigma: float) -> np.typing.NDArra
 
 
 def columns_of(streams: Iterable[str]) -> tuple[str, ...]:
-    """Return the names of the sensors that are optional columns of ``streams``, such as the RSSI of RFID reads."""
+    """Return the names of sensors that are optional columns of ``streams``, such as ``rssi`` of RFID reads."""
     available = set(streams)
     return tuple(name for name in channels() if parent_of(name) in available)
 

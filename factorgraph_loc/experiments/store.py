@@ -75,7 +75,8 @@ Kind = TypeVar("Kind", bound=StoredFile)
 
 
 def parse_stored(kind: type[Kind], content: bytes, path: Path) -> Kind:
-    """Return the JSON ``content`` of the file ``path`` as a model of class ``kind``. Raises DamagedError if invalid."""
+    """Return the JSON ``content`` of the file ``path`` as an object of the class ``kind``. Raises DamagedError if it is
+    invalid."""
     try:
         return kind.model_validate_json(content)
     except ValidationError as error:

@@ -96,8 +96,8 @@ AS_IT_IS = Turned()
 
 
 def not_unit(quaternions: Array) -> Fault:
-    """Return a :class:`Fault`, the data of an error message. Its mask (N,) marks the ``quaternions`` (N, 4) that are
-    not of length 1."""
+    """Return the data of an error message about ``quaternions`` (N, 4) that do not have the length 1, as a
+    :class:`Fault`. Its mask (N,) marks these quaternions. If the mask is False everywhere, there is no error."""
     with np.errstate(over="ignore"):
         length = np.sqrt(np.sum(quaternions**2, axis=1))
     return Fault("length of the quaternion", length, ~(np.abs(length - 1.0) <= UNIT), "1, a unit quaternion")
@@ -134,7 +134,8 @@ def _rise(variances: Array, null: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def null_poses(source: object, row: int, count: int) -> Notice:
-    """Return a warning about ``count`` null poses in the file ``source``. ``row``: the row of the first of them."""
+    """Return a warning about null poses in the file ``source``. ``count``: their number. ``row``: number of the first
+    row."""
     sentence = (
         "{source}:{row}: the pose is null, the first of {poses} null poses: they are skipped, and the motion is unknown "
         "until the next valid pose"

@@ -109,7 +109,7 @@ class PosePath(Exchange):
     ``name``: the name in errors. ``positions`` (N, 3) [m]. ``rotations`` (N, 3, 3): from the body frame to the world
     frame. ``t_ns`` (N,): absolute times [ns], strictly increasing, or None if only the order of the poses is known.
     ``has_rotations``: False if the rotations are meaningless. ``warnings``: problems that a reader corrected.
-    ``lost_ns``: times [ns] of null poses, which are not in the sequence.
+    ``lost_ns``: times [ns] of poses with a zero quaternion, which are not in the sequence.
     """
 
     name: str
@@ -158,8 +158,9 @@ class PosePath(Exchange):
         return replace(self, positions=positions, rotations=rotations, t_ns=t_ns)
 
     def on_floor(self, warnings: list[Notice], turned: Turned = AS_IT_IS) -> Array:
-        """Return planar poses (N, 3): x, y [m], heading [rad]. ``warnings``: a list, extended by warnings about heights
-        or tilts. ``turned``: the axes of the recorded poses, see :func:`~factorgraph_loc.model.planar.on_floor`."""
+        """Return planar poses (N, 3): x, y [m] and heading [rad] of the robot. ``warnings``: a list, to which warnings
+        about heights or tilts are appended. ``turned``: the axes of the recorded poses, and how their frame is mounted
+        on the robot."""
         return on_floor(self.name, self.positions, self.rotations if self.has_rotations else None, warnings, turned)
 
     def headings(self) -> Array:

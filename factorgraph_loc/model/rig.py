@@ -98,7 +98,8 @@ class Rig(FileModel):
         return settings.estimated() if isinstance(settings, SensorSettings) else NOTHING
 
     def time_offset(self, channel: str) -> float:
-        """Return the time offset [s] to add to the timestamps of a stream. ``channel``: the name of the stream."""
+        """Return the time offset [s] to add to the timestamps of a stream. ``channel``: the stream, such as
+        ``rfid``."""
         kind = kind_of(channel)
         settings = self.section(_CLOCKS.get(kind, "") + channel.removeprefix(kind))
         return float(settings.time_offset) if isinstance(settings, SensorSettings) else 0.0

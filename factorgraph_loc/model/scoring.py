@@ -33,12 +33,13 @@ TOLERANCE = 1e-6  # a tick may follow the last measurement by this fraction of a
 class RunConfig:
     """The configuration of a run on a log.
 
-    ``estimator``: the name of the estimator. ``settings``: overrides of its default settings. ``sensors``: names of the
-    sensors to use, None for the default of the rig. ``rssi`` and ``phase`` are optional parts of ``rfid``. ``prior``:
-    the start, see :func:`~factorgraph_loc.experiments.preparation.resolve_prior`. ``seed``: the seed of the estimator's
-    random generator. ``max_gap``: the longest gap [s] between two estimates that scoring interpolates. ``tick_gap``: no
+    ``estimator``: the name of the estimator. ``settings``: {key: value} that replace its default settings. ``sensors``:
+    names of the sensors to use, None for the default of the rig. ``rssi`` and ``phase`` are optional parts of ``rfid``.
+    ``prior``: the start, such as "log" or "unknown", see
+    :func:`~factorgraph_loc.experiments.preparation.resolve_prior`. ``seed``: the seed of the estimator's random
+    generator. ``max_gap``: the longest gap [s] between two estimates that scoring interpolates. ``tick_gap``: no
     estimates are recorded in gaps between measurements longer than this [s]. ``align``: unless it is "none", there are
-    also scores after this alignment with the reference.
+    also scores after this alignment with the reference, such as "se2".
     """
 
     estimator: str

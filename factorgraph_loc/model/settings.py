@@ -61,8 +61,8 @@ def spread_of(sigma: float, covariance: tuple[float, float, float] | None) -> Ar
 class Estimated:
     """The P calibration constants of a sensor that are estimated, as corrections to the values in the rig.
 
-    ``names`` (P,): their names. ``indices`` (P,): their indices among all constants of the sensor. ``sigmas`` (P,):
-    their prior standard deviations.
+    ``names`` (P,): their names. ``indices`` (P,): their indices in the field ``constants`` of the sensor's settings.
+    ``sigmas`` (P,): their prior standard deviations.
     """
 
     names: tuple[str, ...]
@@ -71,8 +71,8 @@ class Estimated:
 
     @staticmethod
     def of(names: Sequence[str], uncertainty: FileModel | None) -> Estimated:
-        """Return the constants among ``names`` with a standard deviation above zero. ``uncertainty``: has the standard
-        deviations as attributes with these names."""
+        """Return the constants among ``names`` that have a prior standard deviation above zero. ``uncertainty``: an
+        object with standard deviations as attributes with these names. None means that all are zero."""
         return Estimated.among(names, np.array([getattr(uncertainty, name, 0.0) for name in names]))
 
     @staticmethod

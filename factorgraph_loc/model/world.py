@@ -21,10 +21,8 @@ L = TypeVar("L", bound=FileModel)
 
 
 class World(FileModel):
-    """A map. ``points``: points that cameras observe. ``walls``: segments (x1, y1, x2, y2) [m].
-
-    Further attributes are dicts of surveyed objects (layers), such as ``landmarks`` by name, and RFID ``tags`` by EPC.
-    """
+    """A map. ``points``: points that cameras observe. ``walls``: segments (x1, y1, x2, y2) [m]. Further attributes
+    (layers) are dictionaries of surveyed objects: ``landmarks`` by name, and RFID ``tags`` by EPC."""
 
     model_config = ConfigDict(arbitrary_types_allowed=True)
 
@@ -48,7 +46,7 @@ class World(FileModel):
         return None if landmark is None else np.array((landmark.x, landmark.y))
 
     def positions(self) -> Array:
-        """Return the positions (K, 2) [m] of all landmarks, in the order of the map."""
+        """Return the positions (K, 2) [m] of all K landmarks, in the order of the map's attribute ``landmarks``."""
         return np.array([(landmark.x, landmark.y) for landmark in self.landmarks.values()]).reshape(-1, 2)
 
 

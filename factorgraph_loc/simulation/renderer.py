@@ -140,10 +140,10 @@ def _stored(
 
 
 class Renderer:
-    """Renders images of a ``scene`` by a camera ``model``.
+    """Renders images of a ``scene`` by a camera ``model``, which has the calibration.
 
-    Arguments ``position`` (3,) and ``rotation`` (3, 3) are the camera pose in the world frame. For a robot on the floor
-    it can be computed by :func:`factors.camera.model.camera_pose`.
+    Arguments ``position`` (3,) [m] and ``rotation`` (3, 3) are the camera pose in the world frame. The function
+    :func:`factors.camera.model.camera_pose` computes it from the pose of a robot on the floor.
     """
 
     def __init__(self, scene: TexturedScene, model: CameraModel, settings: ImageSettings | None = None) -> None:

@@ -99,8 +99,9 @@ class ImageSettings(FileModel):
 class SimulationSettings(FileModel):
     """All settings of a simulation except the seed.
 
-    Further sections, which sensors add: ``sightings`` of landmarks, ``rssi`` and ``phase`` of RFID reads, ``faults`` of
-    RFID reads, and ``pixels`` of points.
+    ``world``: the building with its objects. ``drive``: the path of the robot. Further sections, which sensors add:
+    ``sightings`` of landmarks, ``rssi`` and ``phase`` of RFID reads, ``faults`` of RFID reads, and ``pixels`` of
+    points.
     """
 
     name: str = "office"

@@ -156,6 +156,6 @@ def simulated(function: Callable[[Ride], Simulated], ride: Ride, name: str) -> S
 
 
 def with_sensors(rig: Rig, streams: Iterable[str]) -> Rig:
-    """Return the rig with the ``streams`` of a log added to ``rig.sensors``, the default sensors of estimators."""
+    """Return the rig with the names ``streams`` appended to ``rig.sensors``, the default sensors of estimators."""
     sensors = (*rig.sensors, *(name for name in streams if name not in rig.sensors))
     return rig.model_copy(update={"sensors": sensors})

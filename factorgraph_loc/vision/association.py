@@ -53,8 +53,8 @@ class Associations:
     """M matches between points of a map and features of an image.
 
     ``points`` (M,): the index of the map point of each match. ``features`` (M,): the index of its feature in the image.
-    ``rejected``: the number of matches that were rejected as outliers. ``expected``: the number of map points that
-    should be visible in the image. Without a predicted pose, this is the number of matches before rejection.
+    ``rejected``: the number of further matches that were rejected as outliers. ``expected``: the number of map points
+    that should be visible in the image. If the pose was not predicted, this is the number of matches before rejection.
     """
 
     points: Integers

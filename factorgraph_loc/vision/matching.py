@@ -104,7 +104,7 @@ def nearest_neighbours(distances: Array) -> tuple[Integers, Array, Array]:
 
 def _is_clear(best: Array, second: Array) -> Truths:
     """Return a mask (N,) of the nearest neighbours that are nearer than the second nearest by more than rounding
-    errors. ``best``, ``second`` (N,): the distances of both."""
+    errors. ``best``, ``second`` (N,): the distances of the nearest and of the second nearest neighbour."""
     return np.asarray(second > (1.0 + ROUNDING) * best)
 
 

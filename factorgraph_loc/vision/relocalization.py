@@ -43,7 +43,8 @@ NEAREST = 20  # number of keyframes that an image is compared with
 
 @dataclass(frozen=True)
 class Resection:
-    """A pose ``camera`` computed from K points. ``inliers`` (K,): mask of the points that agree with the pose."""
+    """A camera pose, computed from K points. ``camera``: the pose. ``inliers`` (K,): mask of the points that agree with
+    it."""
 
     camera: CameraPose
     inliers: Truths
@@ -198,8 +199,9 @@ class KeyframeIndex:
         return len(self._descriptions)
 
     def views(self, descriptors: Descriptors) -> Integers:
-        """Return the indices of all descriptors of the :data:`NEAREST` keyframes that are most similar to an image with
-        the ``descriptors`` (N, D)."""
+        """Return the indices (V,) of features in the images of the map that are most similar to a new image.
+        ``descriptors`` (N, D): of the new image. The result has all features of the :data:`NEAREST` most similar
+        keyframes."""
         (description,) = self._vlad_vectors(as_numbers(descriptors), np.zeros(len(descriptors), dtype=np.int64))
         alike = np.zeros(len(self), dtype=bool)
         alike[np.argsort(-(self._descriptions @ description), kind="stable")[:NEAREST]] = True

@@ -126,8 +126,8 @@ def _file_variables(results: Results, metric: str, runs: Runs) -> dict[str, Any]
 
 
 def _scored_metrics(results: Results, keys: Sequence[str], *, whole: bool = True) -> list[Metric]:
-    """Return the metrics with the given ``keys`` that have a score in at least one run. If there are none, return all
-    metrics, or an empty list if ``whole`` is false."""
+    """Return the metrics with the given ``keys`` that have a score in at least one run. If there are none: return all
+    metrics if ``whole`` is true, otherwise an empty list."""
     known = [metric_of(k) for k in keys if any(score(row, k) is not None for row in results.rows)]
     return known or ([metric_of(k) for k in keys] if whole else [])
 

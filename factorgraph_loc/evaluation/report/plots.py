@@ -32,9 +32,10 @@ _NAME = 40  # maximum length of a name at an axis
 
 @dataclass(frozen=True)
 class _Row:
-    """A row of a dot plot: the ``values`` of a variant on each log, and a ``mark`` at their median or mean.
+    """A row of a dot plot, with a label ``name`` and a ``colour``.
 
-    ``band``: the expected interval of the mark, or None.
+    ``values``: the values of a variant (estimator with its settings) on each log. ``mark``: their median or mean, which
+    is marked. ``band``: the expected interval of the mark, or None.
     """
 
     name: str
@@ -139,8 +140,9 @@ def sweeps(results: Results, metrics: Sequence[Metric]) -> Picture | None:
 def sweep(results: Results, column: str, metric: Metric) -> dict[str, list[tuple[float, float, float, float]]]:
     """Return {name of a line: its points} for a plot of a metric over the swept setting ``column``.
 
-    There is a line for each label and each combination of the other swept settings. A point consists of the value of
-    the setting, the pooled metric, and the bounds of its interval, or its minimum and maximum without an interval.
+    ``column``: a column of the results, such as "sweep.smoother.lag". There is a line for each label and each
+    combination of the other swept settings. A point has four numbers: the value of the setting, the pooled metric, and
+    the bounds of its interval. Without an interval these are its minimum and maximum.
     """
     lines: dict[str, dict[float, dict[str, dict[int, float | None]]]] = {}
     for variant in results.variants:

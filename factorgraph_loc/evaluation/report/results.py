@@ -162,9 +162,9 @@ class MetricComparison:
 class Results:
     """The runs of an experiment by variant and log. A variant is an estimator with certain settings and sensors.
 
-    ``variants``: the label of each variant, by its name on the page. ``logs``: the name of each log, by its name on the
-    page. A log with a swept setting of the simulation has several names on the page, but counts as one log in tests.
-    ``rows``: all runs as dictionaries. ``sweeps``: columns of the swept settings that vary.
+    ``variants``: {name of a variant on the page: its label}. ``logs``: {name of a log on the page: its name}. A log
+    with a swept setting of the simulation has several names on the page, but counts as one log in tests. ``rows``: all
+    runs as dictionaries. ``sweeps``: columns of the swept settings that vary.
     """
 
     def __init__(self, rows: pl.DataFrame) -> None:
@@ -282,7 +282,8 @@ def score(row: Row, metric: str) -> float | None:
 
 
 def _best(metric: Metric, scores: Mapping[str, ByLog], figures: Mapping[str, Pooled]) -> str | None:
-    """Return the variant with the best pooled score, or None. A variant must have a score on all logs."""
+    """Return the variant with the best pooled score, or None. Only variants with a score on all logs are compared.
+    ``scores``: by variant, {log: {seed: score}}. ``figures``: by variant, the pooled score."""
     if metric.better is None or not figures:
         return None
     complete = {

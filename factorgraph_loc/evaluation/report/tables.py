@@ -176,8 +176,8 @@ def _difference_cell(c: MetricComparison, variant: str) -> Cell:
 
 
 def _log_cell(metric: Metric, known: Sequence[float], planned: int, best: float | None) -> Cell:
-    """Return a cell with a score on one log. ``known``: the scores of the runs that have one. ``planned``: number of
-    all runs. ``best``: best score in the row."""
+    """Return a cell of a table with a score on one log. ``known``: the scores of the runs that have one. ``planned``:
+    number of all runs. ``best``: best score in the row, which is marked, or None."""
     if not known:
         return Cell(_NONE)
     value = float(average(known, rms=metric.rms))

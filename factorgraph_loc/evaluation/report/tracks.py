@@ -41,7 +41,7 @@ class Scene(BaseModel, frozen=True, allow_inf_nan=False):
 
     @classmethod
     def of(cls, log: Log) -> Scene:
-        """Return the scene of a log, rounded to a millimetre, with objects at the positions that estimators use."""
+        """Return the scene of a log, rounded to a millimetre. Objects are at the positions that estimators use."""
         return cls(
             walls=_plain(np.array(log.world.walls, dtype=float).reshape(-1, 4)),
             layers={layer.layer: _plain(_thinned(layer)) for layer in marks(log)},

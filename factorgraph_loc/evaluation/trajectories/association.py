@@ -139,14 +139,15 @@ def _nothing_in_common(
 
 @dataclass(frozen=True)
 class Similarity:
-    """The transformation ``scale * rotation @ p + translation`` of a point p (3,) [m]."""
+    """The transformation ``scale * rotation @ p + translation`` of a point p (3,) [m]. ``rotation`` (3, 3): a rotation
+    matrix. ``translation`` (3,) [m]. ``scale``: 1 for a rigid transformation."""
 
     rotation: Array
     translation: Array
     scale: float = 1.0
 
     def of(self, path: PosePath) -> PosePath:
-        """Return a path with the transformed poses."""
+        """Return a path with the transformed poses of ``path``. The scale does not affect rotations."""
         positions = self.scale * path.positions @ self.rotation.T + self.translation
         return replace(path, positions=positions, rotations=self.rotation @ path.rotations)
 
@@ -187,7 +188,8 @@ def alignment(estimate: PosePath, reference: PosePath, how: Alignment) -> Simila
 
 
 def _planar(estimate: PosePath, reference: PosePath, how: Alignment) -> Similarity:
-    """Return the least-squares motion in the plane, with a vertical shift if ``how`` is "yaw"."""
+    """Return the least-squares rotation and translation of ``estimate`` in the plane, for the alignments "se2" and
+    "yaw". The heights do not change, except that "yaw" also shifts them by the mean difference from ``reference``."""
     points, targets = estimate.positions[:, :2], reference.positions[:, :2]
     for path, places in ((estimate, points), (reference, targets)):
         if np.abs(places - places[0]).max() <= _DEGENERATE * max(1.0, float(np.abs(places).max())):

@@ -139,11 +139,12 @@ def score_paths(
 ) -> TrajectoryScore:
     """Return the errors of an estimated trajectory against a reference.
 
-    ``align``: see :func:`~factorgraph_loc.evaluation.trajectories.association.alignment`. With "se2" heights are
-    ignored. ``associate_by``, ``max_diff`` [s], ``max_gap`` [s]: how poses are paired, see
-    :func:`~factorgraph_loc.evaluation.trajectories.association.associate`. ``all_pairs``: if true, relative errors are
-    over overlapping pieces, one from each pose, otherwise over successive pieces. ``align_poses``: number of the first
-    poses that determine the alignment, None for all. ``delta``: more lengths of relative errors, such as "5m" or "2s".
+    ``align``: transformation of the estimate before the comparison, from "none" to "sim3", see
+    :func:`~factorgraph_loc.evaluation.trajectories.association.alignment`. With "se2" heights are ignored.
+    ``associate_by``: "nearest" pairs the poses nearest in time, at most ``max_diff`` [s] apart. "interpolate"
+    interpolates estimates, across at most ``max_gap`` [s]. ``all_pairs``: if true, relative errors are over a section
+    of the path from each pose, otherwise over successive sections. ``align_poses``: number of the first poses that
+    determine the alignment, None for all. ``delta``: more lengths of relative errors, such as "5m" or "2s".
 
     Raises InputError if no poses can be paired, the poses do not determine the alignment, or an argument is invalid.
     """
@@ -245,10 +246,11 @@ def _check(align: str, associate_by: str, max_diff: float, max_gap: float) -> No
 def _relative(
     estimate: PosePath, truth: PosePath, steps: Array, length: float, gaps: Integers, *, all_pairs: bool
 ) -> PoseErrors:
-    """Return the translation and rotation of ``Q^-1 P`` for each piece of a path.
+    """Return the position and rotation errors of the estimated motion over each section of a path.
 
-    Q is the motion of the reference over the piece, and P the motion of the estimate. ``steps`` (N - 1,): distances or
-    times between poses. ``length``: of a piece, in the same unit. No piece crosses ``gaps``.
+    They are the translation and the rotation angle of ``Q^-1 P``. Q is the motion of the reference over the section,
+    and P the motion of the estimate. ``steps`` (N - 1,): distances or times between poses. ``length``: of a section, in
+    the same unit. ``gaps``: indices of poses that follow a gap. No section contains a gap.
     """
     cut = pairing.all_pairs if all_pairs else pairing.successive
     inner = np.unique(gaps[(gaps > 0) & (gaps < len(estimate))]).tolist()
@@ -281,8 +283,8 @@ def _angles(rotations: Array) -> Array:
 
 
 def _seconds(estimate: PosePath, truth: PosePath) -> Array | None:
-    """Return the times (N,) [s] of pairs since the first pair, by the timestamps of the estimate or else of the
-    reference. Return None if neither has timestamps."""
+    """Return the times (N,) [s] of N paired poses since the first pair, or None if neither path has timestamps. They
+    are by the timestamps of the ``estimate``, or else of the reference (``truth``)."""
     t_ns = truth.t_ns if estimate.t_ns is None else estimate.t_ns
     return None if t_ns is None else (t_ns - t_ns[:1]) / 1e9
 
