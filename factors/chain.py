@@ -127,7 +127,7 @@ def _eliminated(system: System, damping: float) -> tuple[bool, Array, Array, Arr
 
 @compiled
 def solved(system: System, damping: float) -> tuple[bool, Array, Array]:
-    """Solve the normal equations ``system``, from :func:`normal`, for a step. Their diagonal is multiplied by ``1 +
+    """Return a damped step from the normal equations ``system`` of :func:`normal`, with their diagonal times ``1 +
     damping``.
 
     Returns three values: True if the poses are determined, the step of the poses (N, 3), and the step of the parameters

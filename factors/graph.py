@@ -88,7 +88,7 @@ def is_place(key: int) -> bool:
 
 
 def is_of_keyframe(key: int) -> bool:
-    """True if ``key`` is the key of a pose, or of roll and pitch. A fixed-lag smoother removes these with their
+    """True if ``key`` is the key of a pose, or of roll and pitch. A fixed-lag smoother removes these with a
     keyframe."""
     return key >> _CHARACTER in (_POSE, _TILT)
 
@@ -235,7 +235,8 @@ class VectorPriorFactor:
         self._whitener = np.diag(1.0 / uncertainty) if uncertainty.ndim == 1 else positive.whitener(uncertainty)
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Return the whitened residual (P,) and a list of one Jacobian (P, P)."""
+        """Return the whitened residual (P,) and a list of its Jacobian (P, P). ``values``: one vector (P,) in a
+        list."""
         return self._whitener @ (values[0] - self._mean), [self._whitener]
 
     def cost(self, values: Sequence[Array]) -> float:
@@ -335,7 +336,7 @@ def _whitened(lower: Array, vector: Array, out: Array) -> float:
 
 @compiled(error_model="numpy")
 def _compressed(nll: float, gradient: Array, information: Array) -> tuple[Array, Array]:
-    """Compute :func:`compressed` in compiled code. The arrays must be contiguous."""
+    """Return the residual and the Jacobian of :func:`compressed`, from contiguous arrays."""
     size, curvature, trace = len(gradient), information.copy(), 0.0
     residual, jacobian = np.empty(size + 1), np.zeros((size + 1, size))
     for i in range(size):

@@ -21,8 +21,8 @@ SKEW = 1e-6  # largest asymmetry of a correlation matrix that counts as a roundi
 
 
 def nearest(covariances: Array) -> Array:
-    """Return the nearest symmetric, invertible covariances (..., D, D). Raises LinAlgError if a variance is not
-    positive, or if an element is not finite."""
+    """Return the symmetric, invertible matrices (..., D, D) that are nearest to ``covariances`` (..., D, D). Raises
+    LinAlgError if a variance is not positive, or if an element is not finite."""
     sigmas, values, vectors = _parts(covariances)
     shares = (vectors * values[..., None, :]) @ np.swapaxes(vectors, -1, -2)
     shares = (shares + np.swapaxes(shares, -1, -2)) / 2.0
@@ -71,7 +71,8 @@ def whitener(covariances: Array) -> Array:
 
 
 def root(covariances: Array) -> Array:
-    """Return lower Cholesky factors (..., D, D) of covariances, or of the :func:`nearest` ones if they do not exist."""
+    """Return lower Cholesky factors (..., D, D) of ``covariances``, or of the :func:`nearest` ones if there are
+    none."""
     try:
         return np.asarray(np.linalg.cholesky(covariances))
     except np.linalg.LinAlgError:

@@ -25,7 +25,7 @@ def geman_mcclure_loss(squared: Squared, scale: float) -> Squared:
 
 @register_jitable(inline="always")
 def geman_mcclure_weight(squared: Squared, scale: float) -> Squared:
-    """Return the weights in iteratively reweighted least squares with :func:`geman_mcclure_loss`, same arguments."""
+    """Return the weights in iteratively reweighted least squares with :func:`geman_mcclure_loss` and its arguments."""
     return (1.0 + squared / scale**2) ** -2
 
 
@@ -41,7 +41,6 @@ def huber_loss(squared: Squared, scale: float) -> Squared:
 
 @register_jitable(inline="always")
 def huber_weight(squared: Squared, scale: float) -> Squared:
-    """Return the weights in iteratively reweighted least squares with :func:`huber_loss`. The arguments are the
-    same."""
+    """Return the weights in iteratively reweighted least squares with :func:`huber_loss`, with the same arguments."""
     weight: Squared = scale / np.maximum(np.sqrt(squared), scale)
     return weight

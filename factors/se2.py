@@ -164,7 +164,7 @@ def arc_coefficients(phi: float) -> tuple[float, float]:
 
 
 def _arc_coefficients(phi: Array) -> tuple[Array, Array]:
-    """Return :func:`arc_coefficients` of an array of angles."""
+    """Return ``sin(phi) / phi`` and ``(1 - cos(phi)) / phi`` of an array of angles ``phi``."""
     small = np.abs(phi) < SMALL
     safe = np.where(small, 1.0, phi)
     a = np.where(small, 1.0 - phi**2 / 6.0, np.sin(safe) / safe)
@@ -188,7 +188,7 @@ def _rotation3(heading: Array) -> Array:
 
 @compiled(inline="always")
 def _arc_of_many(angle: float) -> tuple[float, float]:
-    """A faster :func:`arc_coefficients`, with an error of at most 1e-12."""
+    """Return the results of :func:`arc_coefficients` in less time, with an error of at most 1e-12."""
     if abs(angle) > SHORT:
         return math.sin(angle) / angle, 2.0 * math.sin(angle / 2.0) ** 2 / angle
     z = angle * angle
@@ -199,20 +199,20 @@ def _arc_of_many(angle: float) -> tuple[float, float]:
 
 @compiled(inline="always")
 def _wrapped_of_many(angle: float) -> float:
-    """A faster :func:`wrap_scalar`."""
+    """Return one angle [rad], wrapped to (-pi, pi], in less time than :func:`wrap_scalar`."""
     return angle - 2.0 * math.pi * math.ceil((angle - math.pi) / (2.0 * math.pi))
 
 
 @compiled
 def exp_scalars(x: float, y: float, angle: float) -> tuple[float, float, float]:
-    """Return :func:`exp` of one twist (x, y, angle) as three numbers."""
+    """Return the pose (x, y, heading) after following the twist (``x``, ``y``, ``angle``) for unit time."""
     p, q = arc_coefficients(angle)
     return p * x - q * y, q * x + p * y, wrap_scalar(angle)
 
 
 @compiled
 def log_scalars(x: float, y: float, heading: float) -> tuple[float, float, float]:
-    """Return :func:`log` of one pose (x, y, heading) as three numbers."""
+    """Return the twist (x, y, angle) from the origin to the pose (``x``, ``y``, ``heading``) in unit time."""
     angle = wrap_scalar(heading)
     p, q = arc_coefficients(angle)
     scale = 1.0 / (p * p + q * q)
@@ -223,7 +223,7 @@ def log_scalars(x: float, y: float, heading: float) -> tuple[float, float, float
 def compose_scalars(
     x: float, y: float, heading: float, dx: float, dy: float, turned: float
 ) -> tuple[float, float, float]:
-    """Return :func:`compose` of the poses (x, y, heading) and (dx, dy, turned) as three numbers."""
+    """Return the product (x, y, heading) of the poses (``x``, ``y``, ``heading``) and (``dx``, ``dy``, ``turned``)."""
     c, s = math.cos(heading), math.sin(heading)
     return x + c * dx - s * dy, y + s * dx + c * dy, wrap_scalar(heading + turned)
 
@@ -232,7 +232,7 @@ def compose_scalars(
 def between_scalars(
     x: float, y: float, heading: float, to_x: float, to_y: float, to: float
 ) -> tuple[float, float, float]:
-    """Return :func:`between` of the poses (x, y, heading) and (to_x, to_y, to) as three numbers."""
+    """Return the pose (``to_x``, ``to_y``, ``to``) in the frame of the pose (``x``, ``y``, ``heading``)."""
     c, s, dx, dy = math.cos(heading), math.sin(heading), to_x - x, to_y - y
     return c * dx + s * dy, c * dy - s * dx, wrap_scalar(to - heading)
 
@@ -254,13 +254,13 @@ def twist_to(pose: Array, target: Array) -> Array:
 
 @compiled
 def compose_one(a: Array, b: Array) -> Array:
-    """Return :func:`compose` of two poses (3,)."""
+    """Return the pose ``a * b`` (3,) of two poses (3,), with ``b`` given in the frame of ``a``."""
     return np.array(compose_scalars(a[0], a[1], a[2], b[0], b[1], b[2]))
 
 
 @compiled
 def between_one(a: Array, b: Array) -> Array:
-    """Return :func:`between` of two poses (3,)."""
+    """Return the pose ``a^-1 * b`` (3,) of two poses (3,), which is ``b`` in the frame of ``a``."""
     return np.array(between_scalars(a[0], a[1], a[2], b[0], b[1], b[2]))
 
 
@@ -275,7 +275,7 @@ def right_jacobian(xi: Array) -> Array:
 
 @compiled
 def inverse_right_jacobian(xi: Array) -> Array:
-    """Return the inverse (3, 3) of :func:`right_jacobian`."""
+    """Return the inverse (3, 3) of the right Jacobian of :func:`exp` at one twist ``xi`` (3,)."""
     j = right_jacobian(xi)
     p, q, u, v = j[0, 0], j[0, 1], j[0, 2], j[1, 2]
     scale = 1.0 / (p * p + q * q)

@@ -18,8 +18,7 @@ class SightingFactor(Protocol):
     at one time, such as the ranges and bearings of K landmarks."""
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Return the whitened residual (K, g), and a list of its Jacobians (K, g, d), one for each of ``values``
-        (d,)."""
+        """Return the whitened residual (K, g), and a list of its Jacobians (K, g, d) by each of ``values`` (d,)."""
 
     def weight(self, squared: Array) -> Array:
         """Return the robust weights (K,) for ``squared`` (K,), the squared norms of whitened residuals."""
@@ -55,8 +54,8 @@ class Marginalized:
     covariances: tuple[Array | None, ...]
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Return the whitened residual (K, g) and a list of its Jacobian (K, g, 3). ``values``: a list of the pose
-        (3,)."""
+        """Return the whitened residual (K, g) and a list of its Jacobian (K, g, 3). ``values``: one pose (3,) in a
+        list."""
         residual, (by_pose, *by_values) = self.factor.whitened([values[0], *self.values])
         noise = np.eye(residual.shape[1])
         for block, covariance in zip(by_values, self.covariances, strict=True):

@@ -132,7 +132,7 @@ def _iterated(
 
 
 def _informed(prior: Array) -> _Solver:
-    """Return a solver of linearised updates in information form. ``prior`` (S, S): the predicted inverse covariance."""
+    """Return a function that solves linearised updates in information form. ``prior`` (S, S): inverse covariance."""
 
     def solve(blocks: Array, residual: Array, weight: Array, at: Array) -> tuple[Array, Array]:
         information = prior.copy()
@@ -144,8 +144,8 @@ def _informed(prior: Array) -> _Solver:
 
 
 def _rooted(root: Array) -> _Solver:
-    """Return a solver of linearised updates in square-root form. Its covariances are always positive definite. ``root``
-    (S, S): lower Cholesky factor of the predicted covariance."""
+    """Return a function that solves linearised updates in square-root form. Its covariances are always positive
+    definite. ``root`` (S, S): lower Cholesky factor of the predicted covariance."""
 
     def solve(blocks: Array, residual: Array, weight: Array, at: Array) -> tuple[Array, Array]:
         size, scale = len(at), np.sqrt(np.repeat(weight, blocks.shape[1]))
@@ -162,7 +162,8 @@ def _rooted(root: Array) -> _Solver:
 
 @compiled(error_model="numpy")
 def inform(residual: Array, jacobian: Array, columns: Integers, weights: Array, at: Array, total: Array) -> Array:
-    """Add the information of K sightings to ``total`` (S, S), and return their information vector (D,).
+    """Add the information of K sightings to ``total`` (S, S), and return their information vector (D,). A sighting is a
+    measured object with g coordinates.
 
     ``residual`` (K, g), ``jacobian`` (K, g, D): whitened, linearised at the correction ``at`` (S,).
     ``columns`` (D,): the components of the error state that the columns of the Jacobian belong to.
@@ -191,11 +192,12 @@ def inform(residual: Array, jacobian: Array, columns: Integers, weights: Array, 
 def corrected(
     prior: Array, residual: Array, jacobian: Array, columns: Integers, weights: Array, at: Array
 ) -> tuple[Array, Array, Array]:
-    """Run one Kalman update in information form.
+    """Run one Kalman update by K measured objects, in information form.
 
-    ``prior`` (S, S): the inverse covariance of the prediction. The other arguments are those of :func:`inform`. Returns
-    the correction (S,), the covariance (S, S) after it, and the information vector (D,) of the residuals. Raises
-    LinAlgError if the total information is not positive definite.
+    ``prior`` (S, S): the inverse covariance of the prediction. ``residual`` (K, g), ``jacobian`` (K, g, D): whitened,
+    linearised at the correction ``at`` (S,). ``columns`` (D,): the components of the error state of the Jacobian's
+    columns. ``weights`` (K,): weights of the objects. Returns the correction (S,), the covariance (S, S) after it, and
+    the information vector (D,) of the residuals. Raises LinAlgError if the total information is not positive definite.
     """
     total = prior.copy()
     pull = inform(residual, jacobian, columns, weights, at, total)

@@ -83,8 +83,7 @@ class ReprojectionFactor:
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Return the whitened residual (2K,) of K pixels and its Jacobian (2K, d) by each variable of size d.
         ``values``: the pose (3,), then the estimated constants and displacements, see the class. Residual and Jacobians
-        include robust weights and tempering. The noise used to whiten them includes the robot's unknown roll and
-        pitch."""
+        include robust weights and tempering. Their noise includes that of the robot's unknown roll and pitch."""
         if self.of_pose_alone:
             residual, jacobian = pixel_kernels.linearized(self.packed(), np.ascontiguousarray(values[0], dtype=float))
             return residual, [jacobian]
@@ -104,7 +103,7 @@ class ReprojectionFactor:
     def levelled(self, values: Sequence[Array]) -> tuple[Array, Array]:
         """Fit roll and pitch to the K pixels of the image. ``values``: pose, constants and displacements, see the
         class. Returns the whitened residual (K, 2) after the fit, and roll and pitch (2,) in units of their prior
-        standard deviation."""
+        sigma."""
         error, (*_, by_tilt) = self.whitened(values)
         roll, pitch, _ = pixel_kernels.tilted(error, np.ascontiguousarray(by_tilt), float(self.model.robust))
         tilt = np.array((roll, pitch))

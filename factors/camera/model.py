@@ -88,12 +88,11 @@ class CameraModel:
         return len(self.distortion) == 4 and not self.fisheye
 
     def calibration(self) -> gtsam.Cal3DS2:
-        """Return intrinsics and distortion as a GTSAM object. The lens must satisfy :attr:`is_brown`."""
+        """Return intrinsics and distortion as a GTSAM object. Only for Brown's distortion, see :attr:`is_brown`."""
         return gtsam.Cal3DS2(self.fx, self.fy, 0.0, self.cx, self.cy, *self.distortion)
 
     def contains(self, pixels: Array, margin: float = 0.0) -> Any:
-        """Return a mask (...), True where ``pixels`` (..., 2) are in the image or at most ``margin`` [px] outside of
-        it."""
+        """Return a mask (...), True where ``pixels`` (..., 2) are in the image or at most ``margin`` [px] outside."""
         u, v = pixels[..., 0], pixels[..., 1]
         inside = (u >= -0.5 - margin) & (u <= self.width - 0.5 + margin)
         return inside & (v >= -0.5 - margin) & (v <= self.height - 0.5 + margin)
@@ -196,7 +195,7 @@ def rays(model: CameraModel, pixels: Array) -> Array:
 
 
 def folded(model: CameraModel) -> Array | None:
-    """Return a pixel (2,) at which the lens model is not invertible, or None. The pixels of a grid over the image are
+    """Return a pixel (2,) at which the lens model is not invertible, or None. Only a grid of pixels over the image is
     checked.
 
     A lens is invertible at a pixel if a direction within the valid radius projects to the pixel, with a positive
@@ -318,16 +317,16 @@ class TiltScale:
 
     @staticmethod
     def guessed(sigma: float) -> TiltScale:
-        """Return a filter without images, with a rough initial guess ``sigma`` [rad] of the standard deviation."""
+        """Return a filter that has not processed any image. ``sigma`` [rad]: a rough guess of the standard
+        deviation."""
         return TiltScale(sigma, -0.5 * (np.log(SCALES / sigma) / VAGUE) ** 2, np.zeros(len(SCALES)))
 
     def learnt(self, tilt: Array, covariance: Array, prior: float) -> tuple[TiltScale, float]:
-        """Update the filter by the tilt estimated in one image.
+        """Return the filter after an update by the tilt estimated in one image. Also returns the expected standard
+        deviation [rad] of the tilt in this image.
 
         ``tilt`` (2,) [rad], ``covariance`` (2, 2): the estimate of roll and pitch, and its covariance. ``prior`` [rad]:
         the standard deviation of the zero-mean prior of roll and pitch that the estimate was computed with.
-
-        Returns the updated filter, and the expected standard deviation [rad] of the tilt in this image.
         """
         log_evidence = self.log_evidence.copy()
         sigma, image_sigma = _learnt(tilt, covariance, prior, self.guess, log_evidence)
@@ -336,9 +335,9 @@ class TiltScale:
 
 @compiled(error_model="numpy")
 def _learnt(tilt: Array, covariance: Array, prior: float, prior_log: Array, log_evidence: Array) -> tuple[float, float]:
-    """Compute :meth:`TiltScale.learnt`. ``prior_log`` (15,): the log prior of each standard deviation. Updates
-    ``log_evidence`` (15,) in place. Returns the expected standard deviations [rad] of the tilt in later images and in
-    this image."""
+    """Return the expected standard deviations [rad] of the tilt in later images and in this image. ``tilt``,
+    ``covariance``, ``prior``: as in :meth:`TiltScale.learnt`. ``prior_log`` (15,): the log prior of each standard
+    deviation. ``log_evidence`` (15,): the log-likelihood of each standard deviation, is updated in place."""
     determinant = covariance[0, 0] * covariance[1, 1] - covariance[0, 1] ** 2
     a, b, d = covariance[1, 1] / determinant, -covariance[0, 1] / determinant, covariance[0, 0] / determinant
     x, y = a * tilt[0] + b * tilt[1], b * tilt[0] + d * tilt[1]

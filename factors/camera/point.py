@@ -120,12 +120,12 @@ class PointPrior:
 
     @classmethod
     def of(cls, pose: Array, point: Array, sigma: float) -> PointPrior:
-        """Return the prior of a world ``point`` (3,) with standard deviation ``sigma`` [m], for robot pose ``pose``
+        """Return the prior of a world ``point`` (3,) with standard deviation ``sigma`` [m], given the robot's ``pose``
         (3,)."""
         return cls(_from_robot(pose, point), sigma)
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Return the whitened residual (3,), and a list of its Jacobians (3, 3) by the pose and by the point."""
+        """Return the whitened residual (3,), and a list of its Jacobians (3, 3) by pose and point, the ``values``."""
         pose, point = values
         relative = _from_robot(pose, point)
         c, s = math.cos(pose[2]), math.sin(pose[2])

@@ -24,7 +24,8 @@ class PackedImage(NamedTuple):
     ``lens``, ``position``, ``rotation``: the camera. ``points`` (K, 3): world points. ``pixels`` (K, 2): their pixels.
     ``point_covariances``: (K, 3, 3), or (0, 3, 3) for an exact map.
     ``offset`` (3,), ``offset_covariance`` (3, 3): zeros if these fields of the factor are None.
-    ``sigma``, ``robust``, ``tempering``, ``tilt``: fields of :class:`~factors.camera.model.CameraModel`.
+    ``sigma`` [px], ``robust``, ``tempering``: pixel noise, scale of Huber's loss and exponent of the likelihood.
+    ``tilt`` [rad]: standard deviation of the robot's roll and pitch.
     """
 
     lens: Lens
@@ -113,8 +114,7 @@ def linearized(image: PackedImage, pose: Array) -> tuple[Array, Array]:
 
 @compiled(error_model="numpy")
 def tilted(residual: Array, by_tilt: Array, robust: float) -> tuple[float, float, Array]:
-    """Fit the robot's roll and pitch to K points in an image, by iteratively reweighted least squares. The cost is
-    convex.
+    """Fit the robot's roll and pitch to K points in an image, by iteratively reweighted least squares (a convex cost).
 
     ``residual`` (K, 2): the whitened residuals of a level robot. ``by_tilt`` (K, 2, 2): their Jacobian by roll and
     pitch in standard deviations. ``robust``: the scale of Huber's loss. Returns roll and pitch in standard deviations,
@@ -229,8 +229,7 @@ def placed(position: Array, rotation: Array, tilt: float, pose: Array, covarianc
 @compiled(error_model="numpy")
 def pixel_noise(by_point: Array, covariances: Array, sigma: float) -> Array:
     """Return the covariances (K, 2, 2) [px^2] of predicted minus measured pixels. ``by_point`` (K, 2, 3): the Jacobian
-    of the pixels by the points. ``covariances`` (K, 3, 3): covariances of the points. ``sigma`` [px]: the pixel
-    noise."""
+    of pixels by points. ``covariances`` (K, 3, 3): covariances of the points. ``sigma`` [px]: the pixel noise."""
     out = np.empty((len(by_point), 2, 2))
     for k in range(len(by_point)):
         of = covariances[k]

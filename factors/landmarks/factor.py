@@ -91,7 +91,7 @@ class BearingRangeFactor:
     @property
     def kind(self) -> Hashable:
         """A key that is equal for factors that can be linearised together. None if the factor must be linearised alone,
-        because it has a free landmark or a bias."""
+        because the landmark's position or a range bias is estimated."""
         return None if self.free or self.biased else (self.estimated, self.model)
 
     def stack(self, factors: Sequence[BearingRangeFactor], numbers: Sequence[int], column: int) -> BearingRangeStack:
@@ -124,7 +124,7 @@ class BearingRangeFactor:
         return _places(self.estimated)
 
     def cost(self, values: Sequence[Array]) -> float:
-        """Return the sum of robust losses of all landmarks. ``values``: pose, constants, bias, position, see the
+        """Return the sum of robust losses of all landmarks. ``values``: the pose, constants, bias and position of the
         class."""
         error, _, slopes = self._linearized(values)
         return float(losses.loss(self.model.packed, error, slopes))
@@ -168,7 +168,7 @@ class BearingRangeFactor:
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Return the whitened residual (K, 2), predicted minus measured, and a list of its Jacobians (K, 2, d), one for
-        each variable, without robust weights. ``values``: the pose (3,), then the estimated constants, bias and
+        each variable, without robust weights. ``values``: the pose (3,), then estimated constants, bias and
         position."""
         return self._linearized(values)[:2]
 
@@ -214,7 +214,7 @@ class BearingRangeFactor:
         """Return a factor on the pose only, with the other variables fixed at the given values.
 
         ``parameters``: a sequence of one array (P,), the corrections of the estimated constants, or an empty sequence.
-        ``point`` (2,): the position of a free landmark, otherwise None.
+        ``point`` (2,): the position of the landmark if the factor estimates it (``free``), otherwise None.
         ``bias``: the range bias [m].
         """
         if not (parameters or self.biased) and point is None:
@@ -239,7 +239,7 @@ class BearingRangeFactor:
         return int(np.count_nonzero(~np.isnan(self.ranges)) + np.count_nonzero(~np.isnan(self.bearings)))
 
     def locate(self, values: Sequence[Array]) -> tuple[Array, list[Array], Array]:
-        """Compute the position of a single landmark from its range and bearing, to initialise a free landmark.
+        """Return the position of a single landmark from its range and bearing, to initialise an estimate of it.
 
         ``values``: the pose (3,), then the estimated constants and the bias, see the class. Returns the position (2,)
         in the world, its Jacobian (2, d) by each of ``values``, and its covariance (2, 2) due to measurement noise.
@@ -259,7 +259,7 @@ class BearingRangeFactor:
 @dataclass(frozen=True)
 class ResolvedFactor:
     """A landmark ``factor`` for one Kalman update, with Gaussian measurements in place of ranges that may be too long.
-    ``shift`` (K,): is added to the whitened range residuals. ``root`` (K,): the square roots of the measurements'
+    ``shift`` (K,): is added to the whitened range residuals. ``root`` (K,): square roots of the measurements'
     weights."""
 
     factor: BearingRangeFactor
@@ -296,8 +296,8 @@ def landmark_update(
     ``pose`` (3,): the predicted pose. ``covariance`` (S, S): the covariance of the error state. Its first three
     components are the pose. ``constants`` (P,): corrections of the estimated sensor constants. They are the components
     of the error state from index ``first`` on. ``iterations``: the maximum number of iterations. They end earlier when
-    a step is below ``converged``. Returns None for a free landmark, a range bias or a numerically singular matrix. Call
-    ``update_state`` then.
+    a step is below ``converged``. Returns None if the factor estimates a landmark position or a range bias, or if a
+    matrix is singular. Call ``update_state`` then.
     """
     if factor.free or factor.biased:
         return None
@@ -310,7 +310,7 @@ def landmark_update(
 
 
 class BearingRangeStack:
-    """Several landmark factors with the same model and estimated constants, linearised together. No landmark is free.
+    """Several landmark factors with the same model and estimated constants, linearised together. Landmarks are known.
 
     ``factors``: L factors.
     ``pose_of`` (L,): the index of the pose that each factor depends on.

@@ -210,8 +210,7 @@ def _learnt(
 @compiled(error_model="numpy")
 def _averaged(logs: Array, shares: Array, means: Array, sigmas: Array) -> tuple[float, float, float]:
     """Return the share of late (too long) ranges, and the mean and standard deviation [m] of their excess, averaged
-    over all hypotheses. ``logs`` (noises, 1 + H): their log-probabilities. ``shares``, ``means``, ``sigmas`` (H,):
-    their values."""
+    over all hypotheses. ``logs`` (noises, 1 + H): log-probabilities. ``shares``, ``means``, ``sigmas`` (H,): values."""
     share = first = second = 0.0
     for j in range(len(shares)):
         if shares[j] < 1.0:

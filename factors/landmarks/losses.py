@@ -52,8 +52,8 @@ def reweigh(model: Array, error: Array, slopes: Array, weights: Array) -> None:
 
 @compiled
 def weigh(model: Array, error: Array, jacobian: Array, slopes: Array) -> None:
-    """Multiply the whitened residuals ``error`` (K, 2) and their ``jacobian`` (K, 2, D), in place, by the square roots
-    of robust weights. The weights are those of :func:`reweigh`, which is applied first. ``model``, ``slopes``: as in
+    """Multiply the whitened residuals ``error`` (K, 2) and their ``jacobian`` (K, 2, D) in place by square roots of
+    weights. The weights are those of :func:`reweigh`, which is called first. ``model``, ``slopes``: as in
     :func:`loss`."""
     weights = np.empty(len(error))
     reweigh(model, error, slopes, weights)

@@ -102,7 +102,7 @@ def located(model: BearingRangeModel, ranges: Array, bearings: Array) -> Array:
 
 
 def sigmas(model: BearingRangeModel, ranges: Array) -> Array:
-    """Return the standard deviations (K, 2) [m, rad] of range and bearing at ``ranges`` (K,). NaN counts as 0 m."""
+    """Return the standard deviations (K, 2) [m, rad] of range and bearing at ``ranges`` (K,) [m]. NaN counts as 0 m."""
     ranges = np.where(np.isnan(ranges), 0.0, ranges)
     out = np.empty((len(ranges), 2))
     out[:, 0] = np.hypot(model.range_sigma, model.range_sigma_relative * ranges)
@@ -176,9 +176,10 @@ def whitened_into(
     error: Array,
     jacobian: Array,
 ) -> None:
-    """Write the whitened residuals of :func:`residuals` at one pose, with their Jacobian, into arrays.
+    """Write the whitened residuals of ranges and bearings at one pose, predicted minus measured, and their Jacobian.
 
-    ``pose`` (3,): the robot's pose. ``mounting``, ``depth``, ``depth_axis``: as in :class:`BearingRangeModel`.
+    ``pose`` (3,): the robot's pose. ``mounting``: (x, y, heading) of the sensor in the robot frame. ``depth``: True if
+    ranges are measured along the axis ``depth_axis`` [rad], as by a depth camera.
     ``model``: range scale, range sigma, relative range sigma, bearing bias, bearing sigma. ``points`` (K, 2) or (K, 3):
     landmarks. ``ranges``, ``bearings`` (K,): measured, NaN if missing.
     ``error`` (K, 2): output, the residuals. Must contain zeros before the call.
@@ -298,8 +299,7 @@ def _losses(
     covariances: Array,
     losses: Array,
 ) -> None:
-    """Write the negative log-likelihoods of K landmarks at N poses into ``losses`` (N, K), up to a constant per
-    landmark.
+    """Write the negative log-likelihoods of K landmarks at N poses, each up to a constant, into ``losses`` (N, K).
 
     ``constants`` (N, 5): x, y, bearing bias, range scale and depth axis of the sensor for each pose. ``turn``: heading
     of the sensor in the robot frame. ``noise``: range sigma, relative range sigma, bearing sigma. ``depth``: as in

@@ -117,7 +117,8 @@ class OdometryChain:
         return self._insert(t, GYRO, w, 0.0, 0.0, 0.0)
 
     def add_velocities(self, t: Array, v: Array, w: Array) -> int:
-        """Add N velocities (N,) as :meth:`add_velocity` does, in order of time. Returns the number of added ones."""
+        """Add N forward speeds ``v`` and turn rates ``w`` from the times ``t`` on, all (N,) and in order of time.
+        Returns the number of added ones. The others are too old, see :meth:`add_velocity`."""
         if not len(t):
             return 0
         self._reserve(len(t))
@@ -129,8 +130,9 @@ class OdometryChain:
         return len(t)
 
     def add_increments(self, t: Array, dx: Array, dy: Array, dtheta: Array, unknown: Array | None = None) -> None:
-        """Add N motions (N,) as :meth:`add_increment` does, in order of time and after all existing measurements.
-        Motions with equal times are composed."""
+        """Add N motions (N,), each since the previous measurement, in order of time ``t`` and after all existing
+        measurements. Motions with equal times are composed. ``unknown`` (N,) [s]: the times of unknown motion, None for
+        zeros."""
         last, moves = composed(t, np.column_stack((dx, dy, dtheta)))
         if not len(last):
             return
@@ -159,8 +161,8 @@ class OdometryChain:
     def begin_slip(self, since: float) -> None:
         """Report that the wheels slip since ``since`` [s]. The motion is unknown from then until :meth:`end_slip`.
 
-        Limitation: a measurement that is added later and is older than the newest one changes the time of unknown
-        motion.
+        Limitation: a measurement that is added afterwards, but is not the newest, makes the time of unknown motion
+        inexact.
         """
         if not self._constants[SLIPPING] and self._count:
             self._knots[self._count - 1, UNKNOWN] += max(0.0, self._knots[self._count - 1, T] - since)

@@ -64,8 +64,7 @@ def append(
     constants: Array,
     horizon: float,
 ) -> int:
-    """Append velocities to the ``count`` existing rows, write the states at the new rows into ``knots``, and delete old
-    rows.
+    """Append velocities to the ``count`` existing rows, write their states into ``knots``, and delete old rows.
 
     ``t``, ``v``, ``w`` (N,): times [s], forward velocities [m/s] and turn rates [rad/s]. ``delay`` [s]: is added to the
     times. ``constants``: the model as an array. ``horizon`` [s]: as in :func:`without_old`. Returns the new count. If
@@ -210,8 +209,8 @@ def _turn_by_gyro(rows: Array, knots: Array, i: int, constants: Array) -> None:
 @compiled
 def move(knot: Array, duration: float, lag: float, hold: float, slipping: float, out: Array) -> None:
     """Write the integrated odometry state ``duration`` [s] after the state ``knot`` into ``out``. Both are arrays
-    (16,): the fields of :class:`~factors.motion.ChainState`, the velocity (3), the target velocity (3), and two
-    internal values.
+    (16,): the fields of :class:`~factors.motion.ChainState`, velocity (3), target velocity (3), and two internal
+    values.
 
     The velocity converges to the target velocity with the time constant ``lag`` [s], for at most ``hold`` [s]. After
     that the pose is constant and the time is added to the field ``unknown`` of ``out``. If ``slipping`` is 1, the whole

@@ -87,8 +87,7 @@ class OdometryFactor:
 
     def stack(self, factors: Sequence["OdometryFactor"], numbers: Sequence[int], column: int) -> OdometryStack:
         """Combine factors of the same ``kind`` into one object, which is linearised faster. ``numbers``: the index of
-        each factor's first pose. ``column``: the index of the first odometry constant in the parameters of the
-        graph."""
+        each factor's first pose. ``column``: the index of the first odometry constant in the graph's parameters."""
         return OdometryStack(factors, numbers, column)
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
@@ -181,8 +180,7 @@ def linearize(
 def linearize_changed(
     start: Array, end: Array, twist: Array, moving: float, constants: Array, indices: Integers, whitener: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Linearise an increment between the poses ``start`` and ``end``, after a correction for changed odometry
-    constants.
+    """Linearise an increment between the poses ``start`` and ``end``, corrected for changed odometry constants.
     ``twist`` (3,): the logarithm of the increment. ``moving`` [s]: its time in motion. ``constants``, ``indices`` (P,):
     corrections of the constants, and their indices. ``whitener`` and results: as in :func:`linearize`."""
     delta, by_changes = changed(twist, moving, constants, indices)
@@ -252,7 +250,8 @@ def cost_of_all(
     constants: Array,
     indices: Integers,
 ) -> float:
-    """Return half the sum of the squared residuals of :func:`linearize_all` with the same arguments."""
+    """Return half the sum of squared residuals of K increments ``steps``. Increment k is between the poses ``first[k]``
+    and ``first[k] + 1`` of ``poses`` (N, 3). ``constants``, ``indices`` (P,): as in :func:`linearize_all`."""
     total = 0.0
     for k in range(len(first)):
         delta = steps.deltas[k]

@@ -40,8 +40,8 @@ def relative(noise: Array, start: State, end: State) -> tuple[Array, Array, floa
     """Return the motion between two states of the integrated odometry, as in
     :func:`factors.odometry.model.relative_motion`.
 
-    ``noise``: a :data:`Noise` as an array. The results are the relative pose (3,), its covariance (3, 3), the duration
-    [s], and the time at rest [s].
+    ``noise``: the noise of the odometry, a :data:`Noise` as an array. The results are the relative pose (3,), its
+    covariance (3, 3), the duration [s], and the time at rest [s].
     """
     c, s, dx, dy = math.cos(start[3]), math.sin(start[3]), end[1] - start[1], end[2] - start[2]
     x, y, turned = c * dx + s * dy, c * dy - s * dx, wrap_scalar(end[3] - start[3])
@@ -74,8 +74,8 @@ def relative(noise: Array, start: State, end: State) -> tuple[Array, Array, floa
 def relatives(noise: Array, starts: Array, ends: Array, constants: Array, indices: Integers) -> tuple[Array, Array]:
     """Return the motions between N pairs of odometry states (N, 8): relative poses (N, 3) and covariances (N, 3, 3).
 
-    ``noise``: a :data:`Noise` as an array. ``constants`` (P,), ``indices`` (P,): the motions are corrected by these
-    changes of odometry constants, see :func:`recalibrated`.
+    ``noise``: the noise of the odometry, a :data:`Noise` as an array. ``constants`` (P,), ``indices`` (P,): the motions
+    are corrected by these changes of odometry constants, see :func:`recalibrated`.
     """
     count = len(starts)
     deltas, covariances = np.empty((count, 3)), np.empty((count, 3, 3))

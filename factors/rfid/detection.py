@@ -146,7 +146,7 @@ class Score(NamedTuple):
 
     @classmethod
     def of_signals(cls, nll: Array, gradient: Array, information: Array) -> Score:
-        """Return the score of signal strengths or phases, with the given fields. ``expected`` is ``nll``, ``variance``
+        """Return the score of signal strengths or phases with these fields, ``expected`` equal to ``nll``, ``variance``
         zero."""
         return cls(nll, gradient, information, nll, np.zeros(len(nll)))
 
@@ -320,8 +320,8 @@ class RfidLikelihood:
 
     def by_tag(self, pose: Array, counts: TagReadCounts) -> tuple[Array, Array, Array]:
         """Return three arrays about the reads of each tag at one robot pose (3,): the tempered negative log-likelihood
-        (T,), its gradient (T, 2) by the tag's world position, and its Fisher information (T, 2, 2). ``counts`` must
-        list all tags."""
+        (T,), its gradient (T, 2) by the tag's world position, and its Fisher information (T, 2, 2). ``counts``: of all
+        tags."""
         arrays, alpha = counts.packed[:4], self.model.tempering
         pose = np.asarray(pose, dtype=float)
         nll, slope, curve = kernels.by_tag(self.packed, pose, self.tags.points, self.tags.normals, *arrays)

@@ -51,7 +51,8 @@ class TagLikelihood(Protocol):
         """The measurement model, with an attribute ``tempering``, the exponent of the likelihood."""
 
     def score(self, poses: Array, reads: Any, /) -> Score:
-        """Return the tempered likelihood of ``reads`` at poses (N, 3), with derivatives."""
+        """Return the tempered likelihood of ``reads`` (counts, strengths or phases) at poses (N, 3) with
+        derivatives."""
 
     def log_likelihood(self, poses: Array, reads: Any, /) -> Array:
         """Return the tempered log-likelihood (N,) of ``reads`` at poses (N, 3), without derivatives, for particles."""
@@ -124,8 +125,8 @@ class RfidFactor:
         return self.likelihood.joint_score(values[0], self._parameters(values[1]), self.reads, self.estimated)
 
     def log_likelihood(self, poses: Array, values: Array | None = None) -> Array:
-        """Return the tempered log-likelihood (N,) of poses (N, 3). ``values`` (N, P): parameters of each pose, or
-        None."""
+        """Return the tempered log-likelihood (N,) of poses (N, 3). ``values`` (N, P) or None: parameters of each
+        pose."""
         if values is None:
             return self.likelihood.log_likelihood(poses, self.reads)
         assert isinstance(self.likelihood, RfidLikelihood)
@@ -244,7 +245,7 @@ def _corrected(
 ) -> tuple[Array, Array, float, int, float, float, float]:
     """Return the seven results of :meth:`RfidFactor.correct`, computed in compiled code: the correction (3 + P,), the
     covariance after it, the normalised innovation squared and its degrees of freedom, the negative log-likelihood of
-    the prediction minus its mean, its variance, and the log-evidence. ``tags``, ``phase``, ``strength``: as in
+    the prediction minus its mean, its variance, and the log-evidence. The first three arguments are those of
     :func:`_score`."""
     size = len(covariance)
     nll, gradient, information, expected, variance = _score(tags, phase, strength, pose, values)
@@ -355,8 +356,7 @@ def _innovation(gradient: Array, information: Array, covariance: Array, temperin
 
 @compiled(error_model="numpy")
 def _rank(information: Array) -> int:
-    """Return the number of eigenvalues above :data:`LEAST_INFORMATION`, as positive pivots (Sylvester's law of
-    inertia)."""
+    """Return the number of eigenvalues above :data:`LEAST_INFORMATION`, by positive pivots (Sylvester's law)."""
     size, left, count = len(information), information.copy(), 0
     for k in range(size):
         left[k, k] -= LEAST_INFORMATION

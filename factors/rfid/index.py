@@ -122,8 +122,7 @@ def _box(poses: Array, reach: float) -> tuple[Corner, Corner]:
 @compiled
 def near_tags(of_map: MapTags, counts: Counts, poses: Array, reach: float) -> NearTags:
     """Return the tags of a map that may change the likelihood of poses (N, 3), ascending. These are the tags listed in
-    ``counts`` (:attr:`factors.rfid.detection.TagReadCounts.packed`), all tags within ``reach`` [m] of any pose, and
-    some beyond."""
+    ``counts`` (:attr:`factors.rfid.detection.TagReadCounts.packed`) and at least all within ``reach`` [m] of a pose."""
     _, _, _, hits, odds, elsewhere, listed, unlisted_odds, _ = counts
     low, high = _box(poses, reach)
     tags = union(within(of_map.cells, low, high), listed)

@@ -105,8 +105,9 @@ def mixture(
 
 @compiled(inline="always")
 def outcome(q: float, hits: int, rounds: int) -> tuple[float, float, float, float, float]:
-    """Return the negative log-likelihood of ``hits`` reads in ``rounds`` rounds with read probability ``q``. Also
-    returns its derivative by q, the Fisher information on q, and its mean and variance over all outcomes."""
+    """Return five numbers about ``hits`` reads in ``rounds`` rounds with read probability ``q``. They are the negative
+    log-likelihood, its derivative by q, the Fisher information on q, and its mean and variance over all numbers of
+    reads."""
     log_q, log_p = math.log(q), math.log1p(-q)
     nll = -(hits * log_q + (rounds - hits) * log_p)
     gradient = -(hits / q - (rounds - hits) / (1.0 - q))

@@ -73,8 +73,7 @@ class Scan(NamedTuple):
     ``antennas`` (K,), ``rounds`` (K,): antenna and number of rounds of each measurement. ``hits`` (K, W): the number of
     reads of each listed tag. ``number`` (T,): for each tag of the map, in the order of the spatial index, its index
     among the listed tags, or -1. ``odds`` (W,): the prior log-odds that a listed tag is weak, moved or dead.
-    ``elsewhere`` (W,): the log-likelihood of its reads if so. ``unlisted_odds``: the odds of all tags that are not
-    listed.
+    ``elsewhere`` (W,): the log-likelihood of its reads if so. ``unlisted_odds``: the odds of all unlisted tags.
     """
 
     antennas: Integers
@@ -161,7 +160,7 @@ class Places:
     ``antennas``: the model and its tables. ``tables``: the tables by position in the robot frame, empty if the model
     depends on the direction of tags' fronts. ``index``: the spatial index of the map's tags. The other fields are in
     the order of the index. ``points`` (T, 3): positions. ``normals`` (T, 2): unit vectors of the tags' fronts.
-    ``levels`` (A, T): the numbers of their tables in ``antennas``.
+    ``levels`` (A, T): for each antenna and tag, the index of its table in ``antennas``.
     """
 
     antennas: Antennas

@@ -119,7 +119,7 @@ class _Ordered(NamedTuple):
 
 class PhaseProblem(NamedTuple):
     """Phase reads, map and model as arrays for compiled code. ``antennas`` (A, 6): the result of :func:`mounting`.
-    ``points`` (T, 3): tag positions. ``reads``: by group. ``weight``: tempering exponent times concentration kappa."""
+    ``points`` (T, 3): tag positions. ``reads``: sorted by group. ``weight``: tempering exponent times concentration."""
 
     antennas: Array
     points: Array
@@ -128,9 +128,9 @@ class PhaseProblem(NamedTuple):
 
 
 class StrengthProblem(NamedTuple):
-    """Signal strengths, map and model for compiled code: ``antennas`` (A, 6) from :func:`mounting`, ``points`` (T, 3)
-    and ``normals`` (T, 2) of the tags, the fields of the model, and the fields of the reads. ``weight``: the tempering
-    exponent. ``which`` (R,): the antenna of each read."""
+    """Signal strengths, map and model for compiled code. ``antennas`` (A, 6): from :func:`mounting`. ``points`` (T, 3),
+    ``normals`` (T, 2): the tags. ``coefficients``, ``sigma``, ``dof``: as in :class:`RssiModel`. ``weight``: the
+    tempering exponent. ``offsets``, ``which``, ``tags``, ``rssi``: robot pose, antenna, tag and strength of R reads."""
 
     antennas: Array
     points: Array
@@ -148,8 +148,8 @@ class StrengthProblem(NamedTuple):
 @dataclass(frozen=True)
 class PhaseModel:
     """The model of the phases that ``antennas`` measure. ``kappa``: concentration of the von Mises density of twice the
-    phase. ``tempering``: exponent of the likelihood, below 1 for correlated reads. ``max_range`` [m]: more distant tags
-    are ignored, because of reflections. ``min_reads``: minimum of a group (antenna, tag, channel, window)."""
+    phase. ``tempering``: exponent of the likelihood, below 1 for correlated reads. ``max_range`` [m]: tags beyond are
+    ignored, because of reflections. ``min_reads``: least number in a group (antenna, tag, channel, window)."""
 
     antennas: tuple[Antenna, ...]
     kappa: float = 1.0
@@ -183,7 +183,7 @@ class PhaseLikelihood:
 
     def near(self, pose: Array, reads: PhaseReads) -> PhaseReads:
         """Return the reads of tags within the model's ``max_range`` of a robot at ``pose`` (3,), in groups of
-        ``min_reads`` or more. Call this once per window. A selection for each pose would make the likelihood
+        ``min_reads`` or more. Call this once per window. A selection for each pose would make a likelihood
         discontinuous."""
         at = se2.compose(np.asarray(pose, dtype=float), reads.offsets)
         places = self._antennas[reads.antennas]

@@ -216,12 +216,13 @@ def relevant(
 ) -> NDArray[np.bool_]:
     """Return a mask (K, T), True if a tag in a measurement noticeably changes the likelihood of any particle.
 
-    ``poses`` (N, 3), ``parameters`` (N or 1, Q): poses and parameters of the particles. ``packed``: models with the
-    first row of ``parameters`` applied. ``near`` (T,): a mask of tags in reach. ``measured``: offsets, antennas and
-    rounds of K measurements. ``tags``: points, normals, table numbers and hits of T tags.
+    ``poses`` (N, 3), ``parameters`` (N or 1, Q): poses and parameters of the particles. ``packed``, ``tables``: models
+    with the first row of ``parameters`` applied, and their tables. ``near`` (T,): a mask of tags in reach.
+    ``measured``: offsets, antennas and rounds of K measurements. ``tags``: points, normals, table numbers and hits of T
+    tags. ``tempering``: exponent of the likelihood.
 
-    The mask is True for near tags that were read, and for near tags with a relevant read probability. All tags on a
-    robot are relevant.
+    The mask is True for near tags that were read, and for near tags with a relevant read probability. If the tags are
+    on the robot, all are relevant.
     """
     offsets, antennas, rounds = measured
     points, _, levels, hits = tags

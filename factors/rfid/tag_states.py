@@ -138,13 +138,14 @@ class TagStates:
         """Return the log-likelihood (U,) of the reads and misses of ``tags`` (U,) in one scan, given that each tag is
         weak, moved or dead. This is the field ``elsewhere`` of :class:`~factors.rfid.detection.TagReadCounts`.
 
-        ``evidence`` (U, S): the log-likelihood of each tag's reads and misses for each of the ``hypotheses``, relative
-        to the log-likelihood that a tag out of range is never read.
+        ``evidence`` (U, S): the log-likelihood of each tag's reads and misses for each of S states
+        (:attr:`hypotheses`), relative to the log-likelihood that a tag out of range is never read.
         """
         return _expected(self._weights, tags, evidence)
 
     def learn(self, t: float, tags: Integers, evidence: Array) -> None:
-        """Update the filters of ``tags`` (U,) by a scan at ``t`` [s]. ``evidence`` (U, S): as in :meth:`expect`."""
+        """Update the filters of ``tags`` (U,) by a scan at ``t`` [s]. ``evidence`` (U, S): the log-likelihood of each
+        tag's reads and misses for each of S states, as in :meth:`expect`."""
         if len(tags):
             self._evidence.append((t, tags, evidence.astype(np.float32)))
             self._add(tags, self._evidence[-1][2], 1.0)
@@ -163,7 +164,7 @@ class TagStates:
         self._evidence = kept
 
     def _add(self, tags: Integers, evidence: NDArray[np.float32], sign: float) -> None:
-        """Add (``sign`` 1) or remove (``sign`` -1) the ``evidence`` (U, S) of a scan on ``tags`` (U,), see
+        """Add (``sign`` 1) or remove (``sign`` -1) the ``evidence`` (U, S) of a scan on ``tags`` (U,), as in
         :meth:`expect`."""
         if _learn(self._weights, self.odds, tags, evidence, sign):
             self._doubtful = None

@@ -243,8 +243,7 @@ def _chances(
     chance: Array,
 ) -> None:
     """Write the sigmoids of the logits of one tag for one antenna at N poses into ``chance`` (N,). ``at`` (4, N): the
-    antenna's poses. ``unit`` (N,): inverse range scales. ``level``: the table. ``point``, ``normal``: the tag's
-    position and front."""
+    antenna's poses. ``unit`` (N,): inverse range scales. ``level``: the table. ``point``, ``normal``: of the tag."""
     x, y, c, s = at[0], at[1], at[2], at[3]
     tx, ty, height, nx, ny = point[0], point[1], point[2], normal[0], normal[1]
     if packed.kinds[packed.which[antenna]] == LOGISTIC or tables.facings[level] > 1:
