@@ -101,7 +101,8 @@ def trials_of(tests: Sequence[Log], initial: Rig, learnt: Rig, run: Run) -> list
 
 
 def pooled(trials: Sequence[Trial], rig: str, key: str) -> float:
-    """Return one score for all held-out sections, weighted by numbers of poses: root mean square, or mean for ANEES.
+    """Return one score for all held-out sections in ``trials``, weighted by numbers of poses: root mean square, or mean
+    for ANEES.
 
     ``rig``: one of :data:`RIGS`. ``key``: name of the score, such as "final.position_rmse". Only sections with a score
     of both rigs are used, if there are any. Returns NaN if no section has the score.

@@ -233,7 +233,7 @@ class Finder(Protocol):
         """Return ``count`` = N random poses (N, 3) at the last informative measurement, drawn from ``hypotheses``."""
 
     def follow(self, observation: Any, odometry: ChainState, view: View) -> None:
-        """Store an observation for :meth:`refuted_since`. ``odometry``: the odometry state at the time of the
+        """Store ``observation`` for :meth:`refuted_since`. ``odometry``: the odometry state at the time of the
         observation. ``view``: the estimate before the observation corrects it."""
 
     def refuted_since(self, m: Any, odometry: ChainState, pose: Array, covariance: Array) -> float | None:
@@ -313,7 +313,7 @@ class Sensor:
 
     def convex_width(self, factor: Factor, values: Sequence[Array]) -> float:
         """Return the smallest ``width`` of :meth:`at_end` with which the loss of ``factor`` is convex. ``values``: the
-        values of the factor's variables, the pose first."""
+        values of the variables of ``factor``, in its order."""
         return 1.0
 
     def rewind(self, t: float) -> None:

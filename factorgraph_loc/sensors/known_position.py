@@ -21,10 +21,8 @@ START_KEPT = 300.0  # s; if the heading is found later, the final trajectory doe
 
 @dataclass
 class KnownPosition:
-    """A start at a known position with unknown heading.
-
-    ``prior``: the start pose with its covariance. Its heading is ignored. ``motion``: the odometry of the run.
-    """
+    """A start at a known position with unknown heading. ``prior``: the start pose with its covariance. Its heading is
+    ignored. ``motion``: the odometry of the run."""
 
     prior: PosePrior
     motion: Motion

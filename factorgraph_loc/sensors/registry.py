@@ -132,10 +132,8 @@ def channels() -> Mapping[str, Channel]:
 
 @cache
 def sensor_of(channel: str) -> SensorType:
-    """Return the sensor that a channel belongs to. Raises InputError if the channel is unknown.
-
-    ``channel``: the name of a channel or stream, possibly of one of several sensors, such as ``bearing_range.front``.
-    """
+    """Return the sensor that a channel belongs to. Raises InputError if the channel is unknown. ``channel``: the name
+    of a channel or stream, possibly of one of several sensors, such as ``bearing_range.front``."""
     kind = kind_of(channel)
     for sensor in sensors().values():
         if any(own.name == kind for own in sensor.channels) and (kind == channel or kind in several()):

@@ -136,8 +136,8 @@ def _from_cache(file: Path, about: str, kept: FeatureCache) -> _ImageFile:
 
 
 def _find(file: Path, key: str, settings: FrontendSettings, size: Size, kept: FeatureCache) -> _ImageFile:
-    """Return an image file with its detected features, or with the error message if it is unusable. The features are
-    also written to the cache ``kept`` under ``key``. ``size``: width and height of the camera's images [px]."""
+    """Return the image ``file`` with its detected features, or with the error message if it is unusable. The features
+    are also written to the cache ``kept`` under ``key``. ``size``: width and height of the camera's images [px]."""
     try:
         image = read_image(file)
     except InputError as error:
@@ -178,7 +178,8 @@ def _tracks(
     kept: FeatureCache,
 ) -> list[Integers]:
     """Return the track number (K,) of each of the K ``features`` of each image, from the cache ``kept`` if possible.
-    Features of the same point in several images have the same number. A feature without a match has its own number."""
+    Features of the same point in several images have the same number. A feature without a match has its own number.
+    ``images``: the files in the order of ``stream``. ``camera``: the lens model."""
     order = np.argsort(stream.t, kind="stable").tolist()
     about = f"tracks {settings.feature} {camera.intrinsics().tolist()} {code_version(TRACK_CODE)} "
     key = hashlib.sha256(
@@ -200,7 +201,7 @@ def _tracks(
 
 
 def _require_calibrated(log: Log, images: list[_ImageFile], camera: CameraModel) -> None:
-    """Raise InputError if some images are readable, but none has the size that the camera is calibrated for."""
+    """Raise InputError if some ``images`` are readable, but none has the size that ``camera`` is calibrated for."""
     sizes = [image.other_size for image in images if image.other_size is not None]
     if sizes and not any(image.found for image in images):
         width, height = sizes[0]
@@ -291,7 +292,7 @@ def with_markers(log: Log, family: MarkerFamily) -> Log:
 
 
 def _marked(file: Path, family: MarkerFamily, kept: FeatureCache) -> Marked:
-    """Return the markers of a family in an image, from the cache ``kept`` if possible."""
+    """Return the markers of ``family`` in the image ``file``, from the cache ``kept`` if possible."""
     content = read_bytes(file, IMAGE)
     about = f"markers {family} {code_version(CODE)} "
     key = hashlib.sha256(about.encode() + content).hexdigest()

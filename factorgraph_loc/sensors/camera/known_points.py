@@ -242,8 +242,8 @@ class KnownPoints:
     ) -> ReprojectionFactor | None:
         """Return ``factor`` with a new standard deviation of the robot's tilt, which is estimated from the image.
 
-        ``expected``: the same factor with fixed constants. Returns None if the tilt exceeds :data:`STEEPEST`, because
-        the matches are then probably wrong.
+        ``expected``: the same factor with fixed constants. ``predicted``: the estimate of the robot's pose. Returns
+        None if the tilt exceeds :data:`STEEPEST`, because the matches are then probably wrong.
         """
         if expected.estimated:  # errors of the constants have the same effect as a tilt
             return factor
@@ -255,8 +255,8 @@ class KnownPoints:
         return replace(factor, model=replace(factor.model, tilt=sigma))
 
     def _camera(self, expected: ReprojectionFactor, predicted: Predicted) -> CameraPose:
-        """Return the predicted pose of the camera at the image of the factor ``expected``. Its covariance includes the
-        uncertainty of the mounting and of the time offset."""
+        """Return the pose of the camera at the image of the factor ``expected``, from the estimate ``predicted`` of the
+        robot's pose. Its covariance includes the uncertainty of the mounting and of the time offset."""
         pose, covariance = predicted.pose, predicted.covariance
         if expected.offset is not None:
             noise = np.zeros((3, 3)) if expected.offset_covariance is None else expected.offset_covariance

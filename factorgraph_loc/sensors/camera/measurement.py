@@ -199,8 +199,8 @@ def _copy(file: Path, target: Path) -> None:
 
 
 def _image(folder: Path, source: str, name: str) -> Path | None:
-    """Return the path of the image ``name`` in ``folder``, or None if there is no such file. ``source``: the name of
-    the table of images in error messages."""
+    """Return the path of the image ``name`` in ``folder``, or None if there is no such file. ``source``: the file and
+    row with the name, for error messages."""
     try:
         path = inside(folder, name, source)
     except NoFileNameError:

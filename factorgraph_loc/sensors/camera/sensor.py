@@ -326,8 +326,8 @@ class PixelFinder:
 
     @staticmethod
     def _contradicts_start(start: KnownPosition, fix: FoundOnFloor, now: ChainState) -> bool:
-        """Return True if the pose ``fix`` from an image contradicts the known start position and the odometry. ``now``:
-        the odometry state at the image."""
+        """Return True if the pose ``fix`` from an image contradicts the known ``start`` position and the odometry.
+        ``now``: the odometry state at the image."""
         return bool(2.0 * start.loss(fix.pose[None], now, fix.covariance + LEAST)[0] > APART)
 
     def _agree(self) -> bool:
@@ -343,6 +343,7 @@ class PixelFinder:
 
 
 def _distance(pose: Array, covariance: Array, fix: _Fix) -> float:
-    """Return the squared Mahalanobis distance between a pose (3,) with body-frame covariance (3, 3) and ``fix``."""
+    """Return the squared Mahalanobis distance between ``pose`` (3,) with body-frame ``covariance`` (3, 3) and
+    ``fix``."""
     error = se2.log(se2.between(pose, fix.pose))
     return float(error @ positive.solve(covariance + fix.covariance + LEAST, error[:, None])[:, 0])

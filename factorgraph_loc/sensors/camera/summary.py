@@ -214,8 +214,8 @@ def _turns(log: Log, stream: ImageStream) -> Iterator[tuple[float, float]]:
 
 
 def _turned(files: Sequence[Path]) -> float | None:
-    """Return the rotation [rad] of the image content from the first to the second of two images. Returns None if it
-    cannot be estimated. A positive rotation turns the right side of the image downwards."""
+    """Return the rotation [rad] of the image content from the first to the second of two image ``files``. Returns None
+    if it cannot be estimated. A positive rotation turns the right side of the image downwards."""
     finder = extractor(FEATURE, COUNT)
     features = []
     for file in files:

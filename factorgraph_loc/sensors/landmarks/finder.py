@@ -203,7 +203,8 @@ class LandmarkFinder:
 
     def _log_prior(self, window: SightingWindow, poses: Array, covariances: Array) -> Array:
         """Return the logarithm (N,) of the prior probability of N Gaussian modes: the prior density times the volume.
-        ``poses`` (N, 3), ``covariances`` (N, 3, 3): means and body-frame covariances of the modes."""
+        ``window``: the sightings. ``poses`` (N, 3), ``covariances`` (N, 3, 3): means and body-frame covariances of the
+        modes."""
         volume: Array = 0.5 * np.linalg.slogdet(2.0 * math.pi * covariances)[1]
         density = -self._log_volume if self.start is None else self.start.log_density(poses, window.now)
         return np.asarray(np.minimum(volume + density, 0.0))
@@ -241,7 +242,7 @@ class LandmarkFinder:
 
     def _unambiguous(self, window: SightingWindow) -> PosePrior | None:
         """Return the most likely hypothesis if it is unambiguous, otherwise None. The returned pose is refined with
-        correlated odometry errors."""
+        correlated odometry errors. ``window``: the sightings."""
         if not self.hypotheses:
             return None
         best = self.hypotheses[0]
@@ -311,9 +312,7 @@ def _distance(pose: Array, mean: Array, covariance: Array) -> float:
 
 class TrackMonitor:
     """Detects that most of the last sightings contradict the estimated pose, because the pose or the map is wrong.
-
-    ``suspicious_since``: the time [s] since which the sightings contradict the pose, or None.
-    """
+    ``suspicious_since``: the time [s] since which the sightings contradict the pose, or None."""
 
     def __init__(self) -> None:
         self._stamps: list[tuple[float, int, int]] = []

@@ -75,10 +75,8 @@ class BearingRange:
 
 @dataclass(frozen=True)
 class BearingRangeStream(ScanStream):
-    """All sightings of a log, one landmark per row. Rows of one timestamp form one measurement.
-
-    ``landmark``: N names. ``range`` (N,) [m], ``bearing`` (N,) [rad]: NaN if not measured.
-    """
+    """All sightings of a log, one landmark per row. Rows of one timestamp form one measurement. ``landmark``: N names.
+    ``range`` (N,) [m], ``bearing`` (N,) [rad]: NaN if not measured."""
 
     kind: ClassVar[type[Any]] = BearingRange
     landmark: Sequence[str]

@@ -265,7 +265,8 @@ class LandmarkSensor(Sensor):
             yield NewVariable(block, np.zeros(1), np.zeros((1, 3)), {}, np.array([[self._bias**2]]), ())
 
     def _term(self, name: str, factor: BearingRangeFactor, view: View) -> Term:
-        """Return the graph term of the landmark ``name``. It depends on a range bias if the state contains the bias."""
+        """Return the graph term of ``factor``, the sightings of the landmark ``name``. It depends on a range bias if
+        the state has this bias."""
         block = f"{self.modality}/{name}"
         if factor.biased and view.value(f"{block}/bias") is None:
             factor = replace(factor, biased=False)

@@ -77,10 +77,8 @@ def sighting_stream(
 def in_sight(
     model: BearingRangeModel, world: World, poses: Array, settings: SightingSettings
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the indices (K,) of poses and the indices (K,) of landmarks for all K pairs with a visible landmark.
-
-    ``poses`` (N, 3): poses of the robot. A visible landmark is in range, in the field of view, and not behind a wall.
-    """
+    """Return the indices (K,) of poses and the indices (K,) of landmarks for all K pairs with a visible landmark. A
+    visible landmark is in range, in the field of view, and not behind a wall. ``poses`` (N, 3): poses of the robot."""
     points = world.positions()
     sensors = se2.compose(poses, np.array(model.mounting))
     local = se2.transform_to(sensors[:, None], points[None])

@@ -138,7 +138,8 @@ def with_noise(model: OdometryModel, sigmas: Array) -> OdometryModel:
 
 
 def fit_noise(logs: Sequence[Log], model: OdometryModel) -> NoiseFit:
-    """Return the noise of the odometry, fitted to its errors in windows of several lengths, without outliers.
+    """Return the noise of the odometry, fitted to its errors in windows of several lengths in ``logs``, without
+    outliers.
 
     ``model``: the constants of the odometry. Its noise is not used. The fitted noise is enlarged if errors in windows
     of :data:`BLACKOUT` seconds are larger than it predicts.
@@ -247,7 +248,8 @@ class OdometryCalibrator(ConstantsCalibrator):
 
     def parameters(self, parts: Sequence[Windows], settings: OdometrySettings) -> list[Parameter]:
         """Return the constants to estimate, with priors around their values in ``settings``. For logs with commanded
-        velocities, they include delay, lag and slowdown, and the priors of the biases are wider."""
+        velocities, they include delay, lag and slowdown, and the priors of the biases are wider. ``parts``: the windows
+        of each log."""
         commanded = isinstance(odometry_of(parts[0].log), VelocityStream)
         by_speed, by_turn = (0.005, 0.002) if commanded else (0.0005, 0.0005)  # m/s, rad/s; prior sigmas
         priors = {

@@ -86,16 +86,16 @@ def against_reference(log: Log) -> tuple[dict[str, float], list[Notice]]:
 
 
 def _ratio(theirs: Array, ours: Array) -> float | None:
-    """Return the least-squares ratio of ``theirs`` (N,) to ``ours`` (N,), or None if the squares of ``ours`` sum up to
-    1 or less."""
+    """Return the least-squares ratio of ``theirs`` (N,) to ``ours`` (N,), or None if the sum of the squares of ``ours``
+    is at most 1."""
     known = np.isfinite(theirs)
     moved = float(ours[known] @ ours[known])
     return float(ours[known] @ theirs[known]) / moved if moved > 1.0 else None
 
 
 def _doubtful(ratios: Mapping[str, float]) -> list[Notice]:
-    """Return warnings about ratios that are not near 1. Ratios of ``turns`` that suggest another sign or unit are
-    skipped, because :func:`motion_problems` warns about them."""
+    """Return warnings about ``ratios``, from :func:`against_reference`, that are not near 1. Ratios of ``turns`` that
+    suggest another sign or unit are skipped, because :func:`motion_problems` warns about them."""
     keys = {"travels": "scale_distance", "turns": "scale_rotation"}
     sentence = "the reference {moves} {ratio:.2f} times as much as the odometry: set odometry.{setting}, or run fgloc calibrate"
     return [

@@ -51,10 +51,8 @@ def summarize(log: Log) -> Summary:
 
 
 def _ratio(log: Log, t: Array, places: Array) -> float | None:
-    """Return the median ratio, over time spans, of the distance by positions to the distance by odometry.
-
-    ``places`` (N, 2): the measured positions [m] at the times ``t`` (N,) [s]. Returns None if the robot hardly moves.
-    """
+    """Return the median ratio, over time spans, of the distance by positions to the distance by odometry. Returns None
+    if the robot hardly moves. ``places`` (N, 2): the measured positions [m] at the times ``t`` (N,) [s]."""
     stream = log.streams.get("odometry")
     if not isinstance(stream, VelocityStream | IncrementStream) or len(stream.t) < 2:
         return None

@@ -113,10 +113,10 @@ def log_weights(
     """Simulate the reads of J = ``scans`` of M particles on a path, and write their log-likelihoods for all M to
     ``out``.
 
-    ``out`` (J, M): row j receives the log-likelihood of each particle for the reads of particle j. ``poses`` (S, M, 3):
-    the pose of each particle at S points of the path. ``rounds`` (S,): the number of rounds at each point. ``stops``
-    (M,): the number of points that each particle reaches. ``seed``: the seed of random numbers. ``tempering``: the
-    exponent of the likelihood.
+    ``out`` (J, M): row j receives the log-likelihood of each particle for the reads of particle j. ``tables``: the read
+    probabilities and the tags. ``poses`` (S, M, 3): the pose of each particle at S points of the path. ``rounds`` (S,):
+    the number of rounds at each point. ``stops`` (M,): the number of points that each particle reaches. ``seed``: the
+    seed of random numbers. ``tempering``: the exponent of the likelihood.
     """
     steps, count, _ = poses.shape
     tags = len(tables.points)

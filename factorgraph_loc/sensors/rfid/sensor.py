@@ -207,8 +207,8 @@ class TagSensor(Sensor):
         return True
 
     def _count(self, observation: TagObservation, view: View) -> None:
-        """Compare reads with predicted reads. This adapts the tempering of the likelihood, excludes dead antennas, and
-        reports detection models that contradict the reads."""
+        """Compare the reads of ``observation`` with reads predicted at the pose in ``view``. This adapts the tempering
+        of the likelihood, excludes dead antennas, and reports detection models that contradict the reads."""
         assert isinstance(observation.factor.reads, TagReadCounts)
         t, measured, states = observation.t, observation.factor.reads, self.tags.states
         reads = self.tags.likelihood.expected(view.pose, measured, self._estimated(view))

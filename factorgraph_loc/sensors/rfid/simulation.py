@@ -225,7 +225,8 @@ def strengths(
     rng: np.random.Generator,
 ) -> Array:
     """Return the simulated RSSI (N, A, T) [dBm] of reads by the model of :mod:`factors.rfid.signals`, NaN without a
-    read. ``hits`` (N, A, T): a mask of the reads. ``poses`` (N, 3): the robot poses."""
+    read. ``rfid``: the A antennas. ``tags``: the T tags. ``poses`` (N, 3): the robot poses. ``hits`` (N, A, T): a mask
+    of the reads."""
     n, a, tag = np.nonzero(hits)
     reads = RssiReads(poses[n], a, tag, np.full(len(n), np.nan))
     features = strength_features(rfid.model().antennas, tags, np.zeros(3), reads)

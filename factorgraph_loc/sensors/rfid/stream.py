@@ -176,8 +176,8 @@ class RfidRead:
 
 
 def scan_of(t: float, antennas: Iterable[str], reads: Iterable[RfidRead]) -> RfidScan:
-    """Return the scan of inventory rounds that ended at ``t`` [s]. ``antennas``: the antenna of each round. Raises
-    InputError if a read is invalid, or if its antenna or its round is not in the scan."""
+    """Return the scan of inventory rounds that ended at ``t`` [s], with the given ``reads``. ``antennas``: the antenna
+    of each round. Raises InputError if a read is invalid, or if its antenna or its round is not in the scan."""
     t = values.seconds_of("RfidScan", t)
     where = f"RfidScan at {t:.3f} s"
     antenna_names = values.names(where, "antennas", values.items_of(where, "antennas", antennas))

@@ -202,7 +202,8 @@ TURNED, LATE = math.radians(3.0), 0.05  # minimum change of a yaw [rad] and of a
 
 
 def review(use: Use, ending: Ending) -> Review:
-    """Return warnings after a run, and the reliability of the RFID detection models."""
+    """Return warnings after a run, and the reliability of the RFID detection models. ``ending``: the results of the
+    run."""
     use = replace(use, log=installed(use.log)) if "rfid" in use.sensors else use
     models = reliability(use, ending.final_diagnostics, ending.learnt, ending.final)
     return Review((*doubts(use, ending.diagnostics, ending.learnt), *models.warnings), models.reliability)

@@ -176,9 +176,9 @@ def _require_all(inventories: TableRows) -> None:
 
 
 def _named_rounds(reads: TableRows, end_ns: Integers, antenna: list[str]) -> Integers:
-    """Return the round index (N,) of each read, from the row numbers (from 1) in its column ``inventory``. ``end_ns``,
-    ``antenna``: end and antenna of each row of the table of inventories. Raises InputError if a row does not exist, has
-    another antenna, or ends before the read."""
+    """Return the round index (N,) of each read, from the row numbers (from 1) in the column ``inventory`` of ``reads``.
+    ``end_ns``, ``antenna``: end and antenna of each row of the table of inventories. Raises InputError if a row does
+    not exist, has another antenna, or ends before the read."""
     named = reads.numbers["inventory"]
     with np.errstate(invalid="ignore"):
         bad = ~((named >= 1.0) & (named <= len(end_ns)) & (named == np.floor(named)))

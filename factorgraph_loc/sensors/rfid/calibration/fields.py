@@ -171,7 +171,8 @@ def choose(pairs: TagPairs, floor: Floor, antennas: int, *, facing: bool) -> tup
 
 
 def _fit_one(pairs: TagPairs, kind: Kind, floor: Floor) -> DetectionModel:
-    """Return one detection model of a ``kind``, fitted to all ``pairs``."""
+    """Return one detection model of a ``kind``, fitted to all ``pairs``. ``floor``: minimum probabilities of a read and
+    a miss."""
     some = pairs.part(np.arange(len(pairs.facing)) % (1 + len(pairs.facing) // MODEL_PAIRS) == 0)
     if kind.name == "beam":
         return fit_model(some, beam(BeamModel()), floor)[0]

@@ -156,8 +156,8 @@ def relearn_rfid(traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path) ->
 def _mounted(
     traced: Sequence[Traced], settings: RfidSettings, initial: RfidSettings
 ) -> tuple[RfidSettings, list[FittedConstant]]:
-    """Return ``settings`` with the antenna yaws and the time offset that the smoother estimated, and a list of these
-    constants. Constants that the logs do not determine get their value in ``initial``."""
+    """Return ``settings`` with the antenna yaws and the time offset that the smoother estimated on the logs ``traced``,
+    and a list of these constants. Constants that the logs do not determine get their value in ``initial``."""
     known, antennas, constants = initial.uncertainties(), dict(settings.all_antennas()), list[FittedConstant]()
     common = corrections_of("rfid.yaw", traced)
     for name, antenna in antennas.items():
@@ -247,8 +247,9 @@ def _overdispersion(pairs: TagPairs, logit: Array, floor: Floor) -> tuple[float,
 
 
 def _geometry_by_phases(logs: Sequence[Log], settings: RfidSettings, survey: SurveySettings) -> PhaseFit | None:
-    """Return the survey transform and the correction of antenna positions, estimated from phases. Returns None if there
-    are too few phases, or if the estimates do not improve the agreement of the phases."""
+    """Return the survey transform and the correction of antenna positions, estimated from the phases in ``logs``.
+    Returns None if there are too few phases, or if the estimates do not improve the agreement of the phases.
+    ``survey``: the initial transform."""
     try:
         phase = fit_phase(logs, settings, survey)
     except InputError:
@@ -257,8 +258,8 @@ def _geometry_by_phases(logs: Sequence[Log], settings: RfidSettings, survey: Sur
 
 
 def _priors_of(phase: PhaseFit, survey: SurveySettings) -> dict[str, tuple[float, float]]:
-    """Return the changes of survey transform and antenna positions that phases determine: (mean, standard deviation) by
-    name, such as "antennas.x". ``survey``: the transform before the fit."""
+    """Return the changes of survey transform and antenna positions that the fit ``phase`` determines: (mean, standard
+    deviation) by name, such as "antennas.x". ``survey``: the transform before the fit."""
     shift = (phase.survey.x - survey.x, phase.survey.y - survey.y, phase.survey.heading - survey.heading)
     names = (*SURVEY, "antennas.x", "antennas.y")
     return dict(zip(names, zip((*shift, *phase.lever_arm), phase.sigmas.tolist(), strict=True), strict=True))
@@ -310,9 +311,7 @@ def _with_signals(
     logs: Sequence[Log], settings: RfidSettings, survey: SurveySettings, *, focused: bool
 ) -> RfidSettings:
     """Return ``settings`` with models of signal strength (if the logs have it) and of phase (if ``focused``).
-
-    ``focused``: True if the geometry was estimated from phases. Otherwise it is too inaccurate to use phases.
-    """
+    ``focused``: True if the geometry was estimated from phases. Otherwise it is too inaccurate to use phases."""
     changes: dict[str, object] = {}
     try:
         strength = fit_rssi(logs, settings, survey)

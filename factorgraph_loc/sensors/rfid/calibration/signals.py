@@ -57,9 +57,9 @@ class PhaseFit:
 def fit_phase(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings | None = None) -> PhaseFit:
     """Return the survey transform and the correction of antenna positions that maximise the agreement of phases.
 
-    All ``logs`` must have the same world. ``survey``: the initial survey transform. Standard deviations are estimated
-    by a jackknife over time blocks. Raises InputError if a log has no reference, or if too few phases are near their
-    tags.
+    All ``logs`` must have the same world. ``rfid``: the mounting of antennas. ``survey``: the initial survey transform.
+    Standard deviations are estimated by a jackknife over time blocks. Raises InputError if a log has no reference, or
+    if too few phases are near their tags.
     """
     start = survey or SurveySettings()
     focus = _Focus.of(logs, rfid, start)
@@ -160,9 +160,9 @@ DOF = (1.0, 100.0)  # bounds of the degrees of freedom of the noise
 def fit_rssi(logs: Sequence[Log], rfid: RfidSettings, survey: SurveySettings) -> RssiSettings:
     """Return the maximum likelihood model of signal strength (:mod:`factors.rfid.signals`) for all ``logs``.
 
-    ``survey``: the transform of the tags to the world frame. Limitation: the fitted path loss is smaller than in free
-    space, because signals below the sensitivity of the reader are missing. Raises InputError if a log has no reference,
-    or if too few reads have an RSSI.
+    ``rfid``: the mounting of antennas. ``survey``: the transform of the tags to the world frame. Limitation: the fitted
+    path loss is smaller than in free space, because signals below the sensitivity of the reader are missing. Raises
+    InputError if a log has no reference, or if too few reads have an RSSI.
     """
     names = {name: i for i, name in enumerate(rfid.all_antennas())}
     tables, values = list[Array](), list[Array]()
