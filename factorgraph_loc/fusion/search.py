@@ -107,7 +107,7 @@ class Search:
         return self.advance(odometry.t) or is_informative
 
     def queue(self, observation: Evidence, odometry: ChainState) -> None:
-        """Queue an observation of an additional sensor, such as a proximity sensor, for the next call of
+        """Queue an observation of an additional sensor, such as a proximity sensor. The particles process it in
         :meth:`advance`.
 
         It is ignored if the particles have not yet processed an observation of the search's own sensors. ``odometry``:

@@ -116,8 +116,8 @@ class Alignment:
     """The alignment of a new map with a given map.
 
     ``pose`` (3,): x, y and angle of the transform from the new map's frame to the given map's frame. ``covariance``
-    (3, 3): of this transform. ``inliers``: the number of landmarks that agree. ``factor``: a correction by which the
-    covariances of the new landmarks must be multiplied.
+    (3, 3): of this transform. ``inliers``: the number of landmarks that agree. ``factor``: the number by which the
+    covariances of the new landmarks must be multiplied to fit the differences.
     """
 
     pose: Array
@@ -194,8 +194,8 @@ def align_robustly(points: list[LearntPoint], targets: Array, surveys: Array) ->
     factor = float(np.clip(median / MEDIAN * (1.0 + 5.0 / (count - 2)) ** 2, *FACTORS))
 
     def cost(pose: Array) -> float:
-        """Return the sum of squared errors of the alignment ``pose`` (3,). Large errors are truncated, but only those
-        above ``TOLERANCE``."""
+        """Return the sum of squared errors of the alignment ``pose`` (3,). Each squared error counts as at most
+        ``GATE``."""
         error, _, squared = errors(pose)
         tolerated = GATE * np.sum(error**2, axis=1) / TOLERANCE**2
         return float(np.minimum(np.minimum(squared / factor, tolerated), GATE).sum())

@@ -219,10 +219,9 @@ def point_map(
 def _made(
     posed: PosedFrames, adjusted: Bundle, settings: PointSettings, pairs: int, total: int, triangulated: int
 ) -> MadePoints:
-    """Return the map of the points that meet the settings, with its statistics.
-
-    ``pairs``, ``total``, ``triangulated``: the numbers of compared pairs of keyframes, of tracks, and of triangulated points.
-    """
+    """Return the map of the points that meet the ``settings``, with its statistics. ``posed``: the images.
+    ``adjusted``: the adjusted points and cameras. ``pairs``, ``total``, ``triangulated``: the numbers of compared pairs
+    of keyframes, of tracks, and of triangulated points."""
     kept, points, covariances, angles = _kept(adjusted, settings)
     errors = reproject(adjusted.model, adjusted.cameras, points, kept)[0]
     shift = np.linalg.norm(adjusted.cameras.positions - posed.cameras.positions, axis=1)
@@ -266,10 +265,11 @@ def _kept(adjusted: Bundle, settings: PointSettings) -> tuple[Tracks, Array, Arr
 
 
 def _different_views(cameras: Cameras, tracks: Tracks, points: Array, views: int) -> Integers:
-    """Return the indices (V,) of at most ``views`` observations of each point, with viewpoints that differ.
+    """Return the indices (V,) of at most ``views`` observations of each point, from different viewpoints.
 
-    The first selected observation has the most typical direction and distance of the camera. Each further one differs
-    most from the observations that are selected already.
+    The first selected observation of a point has the most typical direction and distance of the camera. Each further
+    one differs most from those already selected. ``cameras``, ``tracks``, ``points`` (T, 3): the camera poses, all
+    observations, and positions.
     """
     chosen: list[int] = []
     order = np.argsort(tracks.track, kind="stable")
@@ -320,8 +320,8 @@ def posed_frames(log: Log, turn_sigma: float = 0.01, shift_sigma: float = 0.02) 
 def _on_robot(model: CameraModel, reference: Trajectory, t: Array, poses: Array, usual: Array) -> tuple[Cameras, Array]:
     """Return the camera poses of a robot on the floor at ``poses`` (F, 3), and their covariances (F, 6, 6).
 
-    ``t`` (F,) [s]: the times of the poses. ``reference``: gives their covariances. ``usual`` (6, 6): the covariance of
-    a camera pose, used if the reference has no covariances.
+    ``t`` (F,) [s]: the times of the poses. ``reference``: the trajectory that supplies their covariances. ``usual``
+    (6, 6): the covariance of a camera pose, used if the reference has no covariances.
     """
     places = [camera_pose(model, pose) for pose in poses]
     cameras = Cameras(

@@ -119,7 +119,8 @@ def _common(first: PointMap, second: PointMap) -> Array | None:
 
 
 def _same(first: PointMap, second: PointMap) -> Integers:
-    """Return pairs (M, 2) of indices of points in the maps ``first`` and ``second`` that are the same point."""
+    """Return pairs (M, 2) of an index in ``first`` and an index in ``second`` that denote the same point. Points are
+    the same if their positions agree, and their most similar descriptors."""
     none = np.empty((0, 2), dtype=np.int64)
     if not (len(first.owners) and len(second.owners)):
         return none

@@ -41,9 +41,10 @@ def focused(
 ) -> dict[int, LearntPoint]:
     """Return positions of tags, by index of the tag, improved by the signal phases of their reads.
 
-    ``learnt``: the initial positions, by index of the tag. ``keyframes``: the estimated trajectory of the robot. If it
-    is None, the log's reference is used. A position does not change if the height of the tag is unknown or too few
-    reads have a phase. No position changes if the rig has no section ``[rfid.phase]``.
+    ``observations``: supplies the names and heights of the tags. ``learnt``: the initial positions, by index of the
+    tag. ``keyframes``: the estimated trajectory of the robot. If it is None, the log's reference is used. A position
+    does not change if the height of the tag is unknown, or if too few reads have a phase. No position changes if the
+    rig has no section ``[rfid.phase]``.
     """
     rfid = log.rig.of(RfidSettings)
     if rfid.phase is None:

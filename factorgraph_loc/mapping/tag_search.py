@@ -140,8 +140,8 @@ def search(model: RfidModel, counts: TagReadCounts, heights: Array, facing: Arra
 
 
 def merged(counts: TagReadCounts, distance: float, angle: float) -> TagReadCounts:
-    """Return the read ``counts`` with consecutive counts of an antenna summed. They are summed while the robot stays
-    within ``distance`` [m] and ``angle`` [rad] of its pose at the first of them."""
+    """Return read ``counts`` in which consecutive counts of an antenna are summed. A sum begins anew when the robot is
+    more than ``distance`` [m] or ``angle`` [rad] from its pose at the first count."""
     group = np.empty(len(counts.antennas), dtype=np.int64)
     first: dict[int, int] = {}
     kept: list[int] = []
@@ -189,8 +189,8 @@ def _lattice_search(
 
 
 def _cells(places: Array, distance: float) -> Array:
-    """Return the lattice points (G, 2) within ``distance`` [m] of at least one of the robot positions ``places`` (K,
-    2)."""
+    """Return the lattice points (G, 2) [m] within ``distance`` [m] of one or more of the robot positions ``places``
+    (K, 2)."""
     low, high = places.min(axis=0) - distance, places.max(axis=0) + distance
     axes = [np.arange(a, b + CELL, CELL) for a, b in zip(low, high, strict=True)]
     x, y = np.meshgrid(*axes, indexing="ij")
@@ -228,12 +228,9 @@ def _nll(
 
 
 def _best(cells: Array, table: list[tuple[Array, float]]) -> list[tuple[float, float, float]]:
-    """Return at most :data:`CANDIDATES` best candidates (x, y, facing) of one tag. They are at least :data:`APART`
-    apart.
-
-    ``table``: pairs of a negative log-likelihood (G,) at the lattice points ``cells`` (G, 2), and a facing. A facing is
-    the direction [rad] of the tag's front.
-    """
+    """Return at most :data:`CANDIDATES` best candidates (x, y, facing) of one tag. Their distances are at least
+    :data:`APART`. A facing is the direction [rad] of the tag's front. ``table``: one pair per facing: the negative
+    log-likelihoods (G,) at the lattice points ``cells`` (G, 2), and the facing."""
     nll = np.stack([column for column, _ in table])
     directions = np.array([direction for _, direction in table])
     out: list[tuple[float, float, float]] = []
@@ -298,8 +295,8 @@ def of_tags(counts: TagReadCounts, tags: Integers) -> TagReadCounts:
 
 
 def reach(model: RfidModel) -> float:
-    """Return the largest distance [m] from the robot at which an antenna reads a tag with at least the probability
-    :data:`LEAST`."""
+    """Return the largest distance [m] between robot and tag at which an antenna reads the tag with at least the
+    probability :data:`LEAST`."""
     out = 0.0
     bearings = np.linspace(-math.pi, math.pi, 24, endpoint=False)
     for antenna in model.antennas:

@@ -164,8 +164,9 @@ def tag_slam(
 ) -> TagSlam:
     """Return the positions of tags and the trajectory of the robot, estimated together.
 
-    ``log``: supplies odometry and rig. ``prior``: the start pose, in the frame of the result. ``known`` (T,): mask of
-    the tags that are fixed at ``observations.positions``. ``progress``: is called with the fraction done.
+    ``log``: supplies odometry and rig. ``observations``: the reads of T tags by antennas. ``prior``: the start pose, in
+    the frame of the result. ``known`` (T,): mask of the tags that are fixed at ``observations.positions``.
+    ``progress``: a function that is called with the completed fraction, 0 to 1.
     """
     problem = _Problem(log, observations, prior, known)
     count = len(problem.t)

@@ -271,11 +271,11 @@ class CommonError:
     """The error of a map that neighbouring points share, because the map was made along an estimated trajectory.
 
     ``places`` (K, 2): positions of the camera when the map was made [m]. ``directions`` (K, 2): mean direction, as a
-    unit vector, from each position to the observed points. ``covariances`` (K, 3, 3): covariance [m, rad] of (x, y,
-    heading) of the shared error at each position.
+    unit vector, from each position to the observed points. ``covariances`` (K, 3, 3): covariance [m, rad] of
+    (x, y, heading) of the shared error at each position.
 
     A robot that localizes in the map has the same error, however many points it observes. Estimators therefore add the
-    covariance of the nearest position to that of the robot's pose.
+    covariance at the nearest position to that of the robot's pose.
     """
 
     places: Array

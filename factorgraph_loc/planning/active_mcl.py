@@ -37,8 +37,8 @@ ONE_PLACE = 0.99  # weight of a mode above which the particles agree on one pose
 @dataclass(frozen=True)
 class ProximityReading:
     """A measurement of a proximity sensor, as an observation that weights the particles of a filter. ``lengths`` (D,)
-    [m]: the measured distances to the next wall in D directions. ``found``, ``work``, ``things``: see
-    :class:`~factorgraph_loc.sensors.base.Observation`; equal for all readings."""
+    [m]: the measured distances to the next wall in D directions. Constants: ``found`` is the number of detected
+    objects, ``work`` the computing cost per pose, ``things`` the detected objects (none)."""
 
     sensor: ProximitySensor
     lengths: Array

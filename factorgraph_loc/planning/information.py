@@ -58,8 +58,8 @@ METRES_PER_RADIAN = 0.5  # m: a turn by one radian takes as much time as driving
 class Sensors:
     """The sensor models of a robot. They predict the information of measurements along a path.
 
-    ``odometry``: the noise of the motion. ``forecasts``: predict the measurements of each sensor that observes objects
-    in the map. ``metres_per_radian`` [m]: the distance driven in the time that a turn by one radian takes.
+    ``odometry``: the noise of the motion. ``forecasts``: one model for each sensor that observes objects in the map. It
+    predicts the measurements. ``metres_per_radian`` [m]: the distance driven in the time of a turn by one radian.
     """
 
     odometry: OdometryModel
@@ -115,8 +115,9 @@ def particle_entropy(poses: Array, weights: Array, dims: int = POSE) -> float:
 
 
 def has_several_modes(poses: Array, weights: Array) -> bool:
-    """True if particles ``poses`` (M, 3) with ``weights`` (M,) are poorly described by a Gaussian. Either their heading
-    is unknown, or a Gaussian with their covariance has more entropy, by more than :data:`SEVERAL`."""
+    """True if a Gaussian is a poor description of particles ``poses`` (M, 3) with ``weights`` (M,). Either their
+    heading is unknown, or a Gaussian with their covariance has much more entropy (by :data:`SEVERAL`) than their
+    histogram."""
     _, covariance = pose_moments(poses, weights)
     if covariance[2, 2] > WIDEST_HEADING**2:
         return True
@@ -142,9 +143,9 @@ def expected_gain(
 
     ``sensors``: models of the sensors. ``particles`` (M, 3), ``weights`` (M,): the belief, in the world frame.
     ``space``: free space. A particle stops and measures nothing where its path leads into a wall. None means no walls.
-    ``places`` (M,): the index of each particle's mode. If given, the entropy is that of this index. Otherwise it is
-    that of the pose at the end of the path. ``noise``: of the odometry, None for no noise. ``samples``: the number of
-    particles to use. ``scans``: the number of these particles at which measurements are simulated.
+    ``places`` (M,): the index of each particle's mode. If given, the entropy of this index is computed, otherwise the
+    entropy of the pose at the end of the path. ``noise``: of the odometry, None for no noise. ``samples``: the number
+    of particles to use. ``scans``: the number of these particles at which measurements are simulated.
     """
     if not paths:
         return np.empty(0)

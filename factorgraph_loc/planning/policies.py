@@ -44,7 +44,7 @@ class Situation:
 
     ``particles`` (M, 3), ``weights`` (M,): the belief. ``modes``: its significant modes. ``sensors``: models of the
     sensors. ``space``: the free space between walls. ``candidates``: C paths. ``free`` (C,) [m]: the length of each
-    path that is free of walls, at most the range of the proximity sensor. ``settings``: of the active run. ``rng``: for
+    path before the first wall, at most the range of the proximity sensor. ``settings``: of the active run. ``rng``: for
     random choices.
     """
 

@@ -49,12 +49,14 @@ class ProximitySensor:
         self._sight = sight
 
     def expected(self, poses: Array) -> Array:
-        """Return the free lengths (M, D) [m] in D directions at ``poses`` (M, 3), measurements without noise."""
+        """Return the lengths (M, D) [m] free of walls in D directions at ``poses`` (M, 3): measurements without
+        noise."""
         steps = free_steps(self.space, poses, self._rays)
         return np.stack([ray.metres[at] for ray, at in zip(self._rays, steps, strict=True)], axis=1)
 
     def read(self, pose: Array, rng: np.random.Generator) -> Array:
-        """Simulate a measurement at the true ``pose`` (3,). Returns free lengths (D,) [m] in D directions."""
+        """Return a simulated measurement at the true ``pose`` (3,): the lengths (D,) [m] free of walls in D
+        directions."""
         true = self.expected(pose[None])[0]
         return np.asarray(np.clip(true + SIGMA * rng.standard_normal(len(true)), 0.0, self._sight))
 

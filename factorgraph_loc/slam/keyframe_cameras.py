@@ -55,10 +55,10 @@ def bundled(
     """Return (pose (3,), tilt (2,)) of each adjusted keyframe, from a bundle adjustment of keyframes and points. A tilt
     is roll and pitch [rad].
 
-    ``keyframes``: consecutive keyframes. The newest ones are adjusted, back to the first that shares too few points
-    with its predecessor, whose pose is fixed. ``poses``: the initial poses of all ``keyframes``. ``waiting``: the
-    observations of each point, by its name. Returns None if there are fewer than :data:`ENOUGH` points, or if most
-    observations of a keyframe do not fit.
+    ``keyframes``: consecutive keyframes. Only the newest ones are adjusted, from the last one that shares too few
+    points with its predecessor. The pose of this one is fixed. ``poses``: the initial poses of all ``keyframes``.
+    ``waiting``: the observations of each point, by its name. Returns None if there are fewer than :data:`ENOUGH`
+    points, or if most observations of a keyframe do not fit.
     """
     often = _seen_often(keyframes[0].index, waiting)
     shared, sees = np.zeros(len(keyframes)), np.zeros(len(keyframes))
@@ -227,7 +227,8 @@ class KeyframeCameras:
         self.anchored: dict[int, bool] = {}
 
     def add(self, keyframe: Keyframe, graph: Graph) -> None:
-        """Store the velocity at a new keyframe. Call this before ``graph`` deletes the odometry at its time."""
+        """Store the robot's velocity at a new keyframe. Call this before ``graph`` deletes the odometry at the
+        keyframe's time."""
         if self._offset is not None:
             self.twists[keyframe.index] = graph.motion.twist(keyframe.t)
 

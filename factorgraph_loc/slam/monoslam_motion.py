@@ -49,8 +49,8 @@ class RobotState:
         )
 
     def minus(self, reference: RobotState) -> Array:
-        """Return the error (12,) of this state relative to ``reference``, in the order rotation, position, velocity,
-        turn rate. It is the inverse of :meth:`plus`."""
+        """Return the error (12,) of this state relative to ``reference``: rotation, position, velocity, turn rate. The
+        method :meth:`plus` of ``reference`` converts this error to this state."""
         turn = log(reference.rotation.T @ self.rotation)
         shift = reference.rotation.T @ (self.position - reference.position)
         return np.concatenate((turn, shift, self.velocity - reference.velocity, self.rate - reference.rate))

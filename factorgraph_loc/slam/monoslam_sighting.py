@@ -146,7 +146,8 @@ class FeatureMatcher:
     def unless_slipped(
         self, m: Pixels, state: SlamState, eye: Eye, added: Array, rarity: float
     ) -> tuple[SlamState, Match]:
-        """Return the state, with a larger covariance if the wheels slipped, and the result of :meth:`match`.
+        """Return the result of :meth:`match`, after ``state``. If the wheels slipped, the returned state has a larger
+        covariance.
 
         ``added`` (3, 3): the covariance of x, y and heading that slip adds. ``rarity``: minus the logarithm of the
         probability of slip. The wheels slipped if the log-likelihood ratio of the pixels exceeds ``rarity``.

@@ -65,10 +65,10 @@ class MapPoint:
 class SlamState:
     """The state of the filter.
 
-    ``robot``: the state of the robot. ``constants`` (P,): corrections of the odometry's constants. ``covariance`` (12 +
-    P + D, 12 + P + D): of the error of robot, constants and points. ``points``, ``values`` (D,): the points of the
-    state, and their values one point after the other. ``tracks``: the numbers of the feature tracks of the newest
-    image. ``met``: the number of points ever added. ``lost``: the number of consecutive images without a match.
+    ``robot``: the state of the robot. ``constants`` (P,): corrections of the odometry's constants. ``covariance``
+    (12 + P + D, 12 + P + D): of the error of robot, constants and points. ``points``, ``values`` (D,): the points of
+    the state, and their values one point after the other. ``tracks``: the identifiers of the feature tracks of the
+    newest image. ``met``: the number of points ever added. ``lost``: the number of consecutive images without a match.
     ``image_odometry``: the odometry at the newest image. ``floor``: the estimated standard deviation of the robot's
     tilt, or None if it is not estimated.
     """
@@ -148,8 +148,8 @@ def of_mounting(camera: CameraSettings) -> Array:
 class Sights:
     """The predicted pixels of K points, with Jacobians.
 
-    ``pixels`` (K, 2) [px]. ``depths`` (K,): positive for a point in front of the camera. The depth of a point with
-    inverse depth is multiplied by the inverse depth. ``by_pose``, ``by_point`` (K, 2, 6): Jacobians with respect to the
+    ``pixels`` (K, 2) [px]. ``depths`` (K,): positive for a point in front of the camera. It is the depth [m], or for a
+    point with inverse depth the product of both. ``by_pose``, ``by_point`` (K, 2, 6): Jacobians with respect to the
     robot's pose and to the point's values. ``starts`` (K,): index of the point's first value in the error state.
     ``sizes`` (K,): number of the point's values, 0 for a point of the map. ``noise`` (K, 2, 2) [px^2]: covariance of
     pixel noise and map errors.
@@ -298,7 +298,7 @@ class Innovation:
 
 
 def squared(residual: Array, covariance: Array) -> Array:
-    """Return the squared Mahalanobis distances (K,) of ``residual`` (K, 2), for a ``covariance`` (K, 2, 2) of each."""
+    """Return the squared Mahalanobis distances (K,) of each ``residual`` (K, 2) with its ``covariance`` (K, 2, 2)."""
     a, b, c = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     x, y = residual[:, 0], residual[:, 1]
     return np.asarray((c * x * x - 2.0 * b * x * y + a * y * y) / (a * c - b * b))

@@ -48,7 +48,8 @@ def sightings_of(model: CameraModel, keyframe: int, pixels: Array) -> list[Point
 @dataclass(frozen=True)
 class ChosenSightings:
     """N observations of points (``sightings``) from a keyframe. ``rows``: the index of each in the image's measurement.
-    ``names``: the name of each point, or the number of its feature track. ``pixels`` (N, 2): the observed pixels."""
+    ``names``: the name of each point, or the identifier of its feature track. ``pixels`` (N, 2): the observed
+    pixels."""
 
     rows: list[int]
     names: list[Hashable]
@@ -87,7 +88,7 @@ class TriangulatedPoint:
 
 class NewPoints:
     """Collects observations of points until the points can be triangulated. ``waiting``: {point: observations} of the
-    points that are not triangulated yet. A point is given by its name, or by the number of its feature track."""
+    points that are not triangulated yet. The key is the name of a point, or the identifier of its feature track."""
 
     def __init__(self, model: CameraModel) -> None:
         self._model = model

@@ -189,9 +189,9 @@ class UnknownPoints(Mapper):
         return pose
 
     def _names_of(self, m: Pixels, rows: Sequence[int], camera: CameraPose, graph: Graph) -> list[Hashable]:
-        """Return the name of the point in each of the ``rows`` of the image ``m``. For a feature, this is the number of
-        the track that first observed its point. Points with a lost track are searched in the image, seen from
-        ``camera``, and keep their name."""
+        """Return the name of the point in each of the ``rows`` of the image ``m``. For a feature, this is the
+        identifier of the track that first observed its point. Points with a lost track are searched in the image, seen
+        from ``camera``, and keep their name."""
         if m.frame is None:
             return [m.names[i] for i in rows]
         tracks = m.frame.tracks[list(rows)].tolist()

@@ -270,7 +270,7 @@ class Smoother(Timeline):
 
     @property
     def _taken_until(self) -> float:
-        """The time [s] up to which all measurements are processed."""
+        """The time [s] until which all measurements are processed."""
         return min((m.t for m in self._behind), default=self._t)
 
     def _catch_up(self) -> None:

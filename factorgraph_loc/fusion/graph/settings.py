@@ -28,7 +28,7 @@ def _lag(value: Any, bounded: ValidatorFunctionWrapHandler) -> Any:
 
 
 def _written(lag: float | None) -> float | str | None:
-    """Return the setting ``lag`` as it is written to a file: "all" instead of infinity."""
+    """Return the setting ``lag`` for a file: "all" instead of infinity, otherwise the value."""
     return "all" if lag == math.inf else lag
 
 
