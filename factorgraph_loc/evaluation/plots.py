@@ -273,7 +273,8 @@ def _extent(e: Errors, trajectory: Trajectory, row: int) -> float:
 
 
 def distribution(axis: Axes, values: Array, **style: Any) -> None:
-    """Plot the cumulative distribution of values on a logarithmic axis."""
+    """Plot the cumulative distribution of ``values`` on a logarithmic axis. ``style``: keyword arguments of
+    matplotlib's plot."""
     values = np.sort(values[np.isfinite(values)])
     axis.set(xscale="log", ylim=(0.0, 1.0))
     if len(values):

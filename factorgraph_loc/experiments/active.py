@@ -44,7 +44,7 @@ PLOTS, PICTURE = "plots", "run.png"
 
 @dataclass(frozen=True)
 class ActiveJob:
-    """A planned simulation of active localization, in which a robot chooses its path to localize itself.
+    """A planned simulation of active localization: a robot chooses its path in order to localize itself.
 
     ``simulation``: the simulated world. ``policy``: name of the method that chooses the path. ``estimator``: name of
     the estimator of the pose. ``seed``: of all random numbers. ``settings``: settings of robot and policy.

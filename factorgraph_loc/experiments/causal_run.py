@@ -66,9 +66,9 @@ class CausalRun:
     """The main loop of one run of an estimator on a log. Estimates are recorded at regular times (``ticks``).
 
     ``guard``: converts exceptions of the estimator to RunFailedError. ``sensors``: names of the used sensors.
-    ``prior``: prior of the start pose, None if it is unknown. ``frame``: converts estimates from the frame of the map
-    to the world frame. ``progress``: called with the completed fraction. ``watch``: called with the time [s] and the
-    estimator after each tick. ``end`` [s]: later measurements are not processed. ``estimates``: the recorded estimates.
+    ``prior``: prior of the start pose, None if it is unknown. ``frame``: adds the error of the map to priors and
+    estimates. ``progress``: called with the completed fraction. ``watch``: called with the time [s] and the estimator
+    after each tick. ``end`` [s]: later measurements are not processed. ``estimates``: the recorded estimates.
     """
 
     guard: Guard
@@ -141,8 +141,8 @@ class CausalRun:
         return takewhile(lambda m: m.t <= self.end, steps)
 
     def _reach(self, t: float) -> None:
-        """Record the estimates at all ticks before ``t`` [s], the time of the next measurement. If ``t`` is later than
-        the start, first initialize the estimator, unless it is initialized already."""
+        """Record the estimates at all ticks before the time ``t`` [s] of the next measurement. If ``t`` is later than
+        the start and the estimator is not initialized yet, first initialize it."""
         if not self._initialized and t > self._start:
             self._initialize()
         self._pass(self.ticks.advance(t))

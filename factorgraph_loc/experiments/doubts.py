@@ -53,8 +53,8 @@ def map_error_warning(log: Log, frame: MapFrame, final: Trajectory) -> tuple[Not
 
 
 def with_pauses(log: Log, skipped: Sequence[tuple[float, float]], tick_gap: float) -> tuple[Notice, ...]:
-    """Return a tuple with a warning about gaps between measurements, in which there are no estimates. Empty without
-    gaps. ``skipped``: begin and end [s] of each gap. ``tick_gap`` [s]: the minimum length of such a gap."""
+    """Return a tuple with a warning about gaps between measurements, which have no estimates. Empty without gaps.
+    ``skipped``: begin and end [s] of each gap. ``tick_gap`` [s]: the minimum length of such a gap."""
     if not skipped:
         return ()
     begin, end = max(skipped, key=lambda gap: gap[1] - gap[0])

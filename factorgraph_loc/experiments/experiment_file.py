@@ -111,7 +111,8 @@ class LogEntry(FileModel):
 
 
 class EstimatorEntry(FileModel):
-    """An estimator in an experiment file: ``name``, ``settings``, and ``label``, its name in the results if not ""."""
+    """An estimator in an experiment file. ``name``: of the estimator. ``settings``: {key: value} that replace its
+    defaults. ``label``: its name in the results. If it is "", the results have ``name``."""
 
     name: Name
     label: str = ""

@@ -148,8 +148,8 @@ class RecordedSource(LogSource):
 
 @dataclass(frozen=True)
 class SimulatedSource(LogSource):
-    """A simulated log. ``preset``: a name or a TOML file. ``settings``: changed settings as JSON. ``seed``: for
-    noise."""
+    """A simulated log. ``preset``: name of a preset, or path of a TOML file. ``settings``: changed settings as JSON.
+    ``seed``: seed of all random numbers."""
 
     preset: str
     settings: str = "{}"

@@ -118,7 +118,8 @@ def _keep(result: RunResult, log: Log, align: Alignment) -> Path | None:
 
 
 def write_files(result: RunResult, log: Log, scores: Mapping[str, Any], folder: Path) -> None:
-    """Write the files of a run, see :func:`write_run`, into an empty folder, except for a map. ``scores``: by key."""
+    """Write the files of a run, except for a map, into an empty ``folder``. ``scores``: {key: value}. The files are
+    described in :func:`write_run`."""
     causal = result.causal() or Trajectory(np.empty(0), np.empty((0, 3)))
     write_tum(result.final, folder / FINAL, log.t0_ns)
     write_tum(causal, folder / CAUSAL, log.t0_ns)

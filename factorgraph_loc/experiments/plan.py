@@ -70,10 +70,8 @@ class PlannedRun(RunConfig):
         }
 
     def make(self) -> dict[str, bytes]:
-        """Execute the run. Return its files as {file name: content}.
-
-        Raises VanishedError if the log has changed since the experiment was planned, and FglocError if the run fails.
-        """
+        """Execute the run. Return its files as {file name: content}. Raises VanishedError if the log has changed since
+        the experiment was planned, and FglocError if the run fails."""
         from factorgraph_loc.experiments.output import run_files  # noqa: PLC0415
         from factorgraph_loc.experiments.run import run  # noqa: PLC0415
 

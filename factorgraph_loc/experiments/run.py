@@ -118,10 +118,9 @@ class _Start(NamedTuple):
 
 
 def _start(use: Use, config: RunConfig, estimator: Estimator, prior: PosePrior | None, source: str) -> _Start:
-    """Return the start of a run. ``prior``, ``source``: what :func:`resolve_prior` returned.
-
-    Raises InputError if the estimator cannot start from an unknown pose or an unknown heading.
-    """
+    """Return the start of a run, after a check that the estimator can use it. ``prior``: the prior of the start pose,
+    None if the start is unknown. ``source``: the name of its source, such as "log". Raises InputError if the estimator
+    cannot start from an unknown pose or an unknown heading."""
     log = use.log
     if prior is None and config.prior is None and not detecting(log.world, log.streams):
         sentence = "{log}: has neither a start nor a reference: begins at (0, 0, 0); set --prior for another start"

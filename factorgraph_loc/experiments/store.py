@@ -183,9 +183,7 @@ class Store:
 
     def put(self, key: str, files: Mapping[str, bytes]) -> None:
         """Write the files of a run atomically, and replace existing ones. The caller must lock the run (:meth:`claim`).
-
-        ``files``: {file name: content}.
-        """
+        ``files``: {file name: content}."""
         checksums = {name: _sha256(content) for name, content in files.items() if name != TIMINGS}
         manifest = json.dumps({"key": key, "files": checksums}, indent=1).encode()
         temporary = self.folder / "tmp" / key

@@ -88,8 +88,8 @@ class Diagnostics:
         """Append an event at time ``t`` [s] to the list ``events``. An event that is already in the list is not
         appended.
 
-        ``kind``: an identifier of the type of event. ``sentence``: the text of the event, in which names in braces are
-        replaced by ``fields``. For example ``"rebuilt: {why}", why="singular"``.
+        ``kind``: an identifier of the type of event. ``sentence``: the text of the event, with names of ``fields`` in
+        braces. For example ``"rebuilt: {why}", why="singular"`` has the text "rebuilt: singular".
         """
         event = Event(kind, sentence, fields, t)
         if event not in self.events:
@@ -116,9 +116,9 @@ class Diagnostics:
         )
 
     def record(self) -> list[Addition]:
-        """Start to record additions to these diagnostics, and return the list to which they will be appended. Pass this
-        list to :meth:`take_back` to undo the additions. Recording ends when ``added`` is set to None. Limitation: late
-        measurements and events are not recorded."""
+        """Start to record additions to these diagnostics, and return the list of them. Later additions are appended to
+        it. Pass this list to :meth:`take_back` to undo the additions. Recording ends when ``added`` is set to None.
+        Limitation: late measurements and events are not recorded."""
         self.added = []
         return self.added
 

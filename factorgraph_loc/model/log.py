@@ -62,9 +62,7 @@ class Log:
 
     def span(self) -> tuple[float, float]:
         """Return the first and the last timestamp [s] of all streams, or of the reference if there are no streams.
-
-        Returns (0, 0) if there are no timestamps.
-        """
+        Returns (0, 0) if there are no timestamps."""
         stamps = [(s.t.min(), s.t.max()) for s in self.streams.values() if len(s.t)]
         if not self.streams and self.reference:
             stamps = [(self.reference.t[0], self.reference.t[-1])]
@@ -103,9 +101,9 @@ class Log:
         yield from _pieces(rows, late, first, len(arrived))
 
     def alone(self, sensor: str) -> Log:
-        """Return the log with ``sensor`` as the only sensor of its kind. The sensor is renamed to the kind:
-        ``bearing_range.front`` becomes ``bearing_range``. Other kinds do not change. If ``sensor`` has no dot, the log
-        is returned unchanged."""
+        """Return the log with ``sensor`` as the only sensor of its kind. The sensor is renamed to its kind. For example
+        ``bearing_range.front`` becomes ``bearing_range``, and ``bearing_range.back`` is left out. Other kinds do not
+        change. If ``sensor`` has no dot, the log is returned unchanged."""
         if kind_of(sensor) == sensor:
             return self
         streams = {name: self.streams[old] for name, old in as_only(self.streams, sensor).items()}
@@ -119,10 +117,8 @@ class Log:
         self, order: Sequence[str], without: int | None = None
     ) -> list[Iterator[tuple[float, int, int, Measurement]]]:
         """Return an iterator per stream in ``order`` over its measurements, as sortable tuples. ``without``: the index
-        of a stream in ``order`` that is left out.
-
-        A tuple has the time of arrival [s], the index of the stream, the index of the row, and the measurement.
-        """
+        of a stream in ``order`` that is left out. A tuple has the time of arrival [s], the index of the stream, the
+        index of the row, and the measurement."""
 
         def arrivals(rank: int, name: str) -> Iterator[tuple[float, int, int, Measurement]]:
             latest = -np.inf

@@ -107,8 +107,8 @@ def are_null(quaternions: Array, variances: Array | None = None) -> NDArray[np.b
     """Return a mask (N,) of null poses, which some programs publish while they do not know the pose.
 
     ``quaternions`` (N, 4): a pose with a zero quaternion is null, unless more than half of all quaternions are zero.
-    ``variances`` (N, 2) [m^2] of x and y: a variance of a null pose is at least :data:`HUGE`, and far above that of the
-    last valid pose.
+    ``variances`` (N, 2) [m^2] of x and y, or None. A pose is also null if one of them is at least :data:`HUGE`, and far
+    above that of the last valid pose.
     """
     null = np.asarray(~quaternions.any(axis=1))
     if 2 * np.count_nonzero(null) > len(null):

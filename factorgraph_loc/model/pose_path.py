@@ -27,10 +27,8 @@ class Exchange:
 
     @classmethod
     def from_numpy(cls, table: Array) -> Self:
-        """Return a trajectory from an array with the columns of :meth:`to_numpy`, one row per pose.
-
-        Raises InputError if the number of columns is wrong, or if the times do not increase.
-        """
+        """Return a trajectory from an array with the columns of :meth:`to_numpy`, one row per pose. Raises InputError
+        if the number of columns is wrong, or if the times do not increase."""
         rows = np.asarray(table, dtype=float)
         columns = cls._columns()
         if rows.ndim != 2 or rows.shape[1] != len(columns):
@@ -41,17 +39,13 @@ class Exchange:
 
     @abstractmethod
     def to_numpy(self) -> Array:
-        """Return the poses as an array, one row per pose: the time t [s] first, then the pose.
-
-        The shape is (N, 4) for planar poses and (N, 8) for poses with quaternions.
-        """
+        """Return the poses as an array, one row per pose: the time t [s] first, then the pose. The shape is (N, 4) for
+        planar poses and (N, 8) for poses with quaternions."""
 
     @classmethod
     def from_polars(cls, table: pl.DataFrame) -> Self:
-        """Return a trajectory from a table with the columns of :meth:`to_polars`. Other columns are ignored.
-
-        Raises InputError if a column is missing, or if it has values that are not numbers.
-        """
+        """Return a trajectory from a table with the columns of :meth:`to_polars`. Other columns are ignored. Raises
+        InputError if a column is missing, or if it has values that are not numbers."""
         if missing := [name for name in cls._columns() if name not in table.columns]:
             raise InputError(f"the table has no column {missing[0]}, expected {', '.join(cls._columns())}")
         return cls.from_numpy(numbers(table, cls._columns()))
@@ -145,10 +139,8 @@ class PosePath(Exchange):
         return replace(self, positions=self.positions[which], rotations=self.rotations[which], t_ns=t_ns)
 
     def at(self, t_ns: Integers) -> PosePath:
-        """Return the poses at times ``t_ns`` (M,) [ns], which must lie between the first and the last time.
-
-        Positions are interpolated linearly, rotations by spherical linear interpolation.
-        """
+        """Return the poses at times ``t_ns`` (M,) [ns], which must lie between the first and the last time. Positions
+        are interpolated linearly, rotations by spherical linear interpolation."""
         if len(self) == 1:
             return replace(self.rows(np.zeros(len(t_ns), dtype=np.int64)), t_ns=t_ns)
         own, t = (checks.seconds(stamps, int(self.stamps()[0])) for stamps in (self.stamps(), t_ns))
@@ -158,8 +150,8 @@ class PosePath(Exchange):
         return replace(self, positions=positions, rotations=rotations, t_ns=t_ns)
 
     def on_floor(self, warnings: list[Notice], turned: Turned = AS_IT_IS) -> Array:
-        """Return planar poses (N, 3): x, y [m] and heading [rad] of the robot. ``warnings``: a list, to which warnings
-        about heights or tilts are appended. ``turned``: the axes of the recorded poses, and how their frame is mounted
+        """Return planar poses (N, 3): x, y [m] and heading [rad] of the robot. ``warnings``: a list. Warnings about
+        heights or tilts are appended to it. ``turned``: the axes of the recorded poses, and how their frame is mounted
         on the robot."""
         return on_floor(self.name, self.positions, self.rotations if self.has_rotations else None, warnings, turned)
 

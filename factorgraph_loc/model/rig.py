@@ -68,19 +68,17 @@ class Rig(FileModel):
         return tuple(dict.fromkeys(each for name in sensors for each in self.names(name) or (name,)))
 
     def alone(self, sensor: str) -> Self:
-        """Return the rig with ``sensor`` as the only sensor of its kind. The sensor is renamed to the kind:
-        ``bearing_range.front`` becomes ``bearing_range``. Other kinds do not change. If ``sensor`` has no dot, the rig
-        is returned unchanged."""
+        """Return the rig with ``sensor`` as the only sensor of its kind. The sensor is renamed to its kind. For example
+        ``bearing_range.front`` becomes ``bearing_range``, and ``bearing_range.back`` is left out. Other kinds do not
+        change. If ``sensor`` has no dot, the rig is returned unchanged."""
         if kind_of(sensor) == sensor:
             return self
         sensors = tuple(as_only(self.sensors, sensor))
         return self.model_copy(update={kind_of(sensor): self.section(sensor), "sensors": sensors})
 
     def find(self, kind: type[S], section: str | None = None) -> S | None:
-        """Return the settings of class ``kind``, or None if the rig lacks them.
-
-        ``section``: the name of the section, needed if several sections have this class.
-        """
+        """Return the settings of class ``kind``, or None if the rig lacks them. ``section``: the name of the section,
+        needed if several sections have this class."""
         settings: S | None = self.section(section or _SECTIONS[kind])
         return settings
 

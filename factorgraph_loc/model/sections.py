@@ -90,10 +90,8 @@ def kind_of(name: str) -> str:
 
 
 def as_only(names: Iterable[str], chosen: str) -> dict[str, str]:
-    """Return {new name: old name} of sensors, after ``chosen`` has become the only sensor of its kind.
-
-    The new name of ``chosen`` is the name of its kind. Other sensors of that kind in ``names`` are left out.
-    """
+    """Return {new name: old name} of sensors, after ``chosen`` has become the only sensor of its kind. ``names``: all
+    sensors. The new name of ``chosen`` is the name of its kind. Other sensors of that kind are left out."""
     kind = kind_of(chosen)
     return {kind if name == chosen else name: name for name in names if name == chosen or kind_of(name) != kind}
 

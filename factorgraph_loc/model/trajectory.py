@@ -46,10 +46,8 @@ class Trajectory(Exchange):
 
     @classmethod
     def of(cls, path: PosePath, t0_ns: int = 0) -> Self:
-        """Return the planar poses of a path, at times in seconds after ``t0_ns`` [ns since 1970].
-
-        Raises InputError if the path has no times, if times do not increase, or if heights vary by metres.
-        """
+        """Return the planar poses of a path, at times in seconds after ``t0_ns`` [ns since 1970]. Raises InputError if
+        the path has no times, if times do not increase, or if heights vary by metres."""
         return cls(checks.seconds(path.stamps(), t0_ns), path.on_floor([]), has_heading=path.has_rotations)
 
     def path(self, name: str, t0_ns: int = 0) -> PosePath:
@@ -65,10 +63,8 @@ class Trajectory(Exchange):
         return replace(self, t=self.t[which], poses=self.poses[which], covariances=covariances)
 
     def at(self, t: Array, *, max_gap: float = np.inf) -> Array:
-        """Return the poses (M, 3) at times ``t`` (M,) [s], interpolated on SE(2).
-
-        A pose is NaN outside of the trajectory, and in a gap longer than ``max_gap`` [s].
-        """
+        """Return the poses (M, 3) at times ``t`` (M,) [s], interpolated on SE(2). A pose is NaN outside of the
+        trajectory, and in a gap longer than ``max_gap`` [s]."""
         out = np.full((len(t), 3), np.nan)
         if len(self.t) == 0:
             return out

@@ -40,9 +40,9 @@ class Surroundings(NamedTuple):
     """The M faces of a building that are visible from a camera position, prepared for ray casting.
 
     ``origin`` (3,) [m]: the camera position. ``table`` (M, 13): the faces, sorted by distance; its columns are the
-    constants of this module. ``starts`` (BINS + 1,), ``items``: a ray in the horizontal bin b can hit only the rows of
-    the table in ``items[starts[b] : starts[b + 1]]``. ``size`` (5,): width, depth, height, inverse width and inverse
-    depth of the building.
+    constants of this module. Horizontal directions are divided into BINS bins. ``starts`` (BINS + 1,), ``items``: a ray
+    in the bin b can hit only the rows of the table in ``items[starts[b] : starts[b + 1]]``. ``size`` (5,): width,
+    depth, height, inverse width and inverse depth of the building.
     """
 
     origin: Array
@@ -54,10 +54,10 @@ class Surroundings(NamedTuple):
 
 @compiled(error_model="numpy")
 def surroundings(faces: Array, bottoms: Array, tops: Array, origin: Array, size: Array) -> Surroundings:
-    """Return the faces that are visible from the camera position ``origin`` (3,) [m].
+    """Return the faces that are visible from the camera position ``origin`` (3,) [m], prepared for ray casting.
 
     ``faces`` (F, 4): all faces of the building as segments (x1, y1, x2, y2) [m]. ``bottoms``, ``tops`` (F,) [m]: their
-    heights. ``size`` (5,): see :class:`Surroundings`.
+    heights. ``size`` (5,): width, depth, height [m], inverse width and inverse depth [1/m] of the building.
     """
     table = np.empty((len(faces), 13))
     lows, highs = np.empty(len(faces)), np.empty(len(faces))

@@ -246,8 +246,8 @@ PRESETS: Mapping[str, Mapping[str, Any]] = {
 
 
 def preset(name: str, changes: Mapping[str, Any] | None = None) -> SimulationSettings:
-    """Return the settings of the preset ``name``. ``changes``: nested tables of the values that differ from the preset.
-    Raises InputError for an unknown preset or key, or for a value out of bounds."""
+    """Return the settings of the preset ``name``, such as "office". ``changes``: nested tables of values that replace
+    those of the preset. Raises InputError for an unknown preset or key, or for a value out of bounds."""
     content = merged(_preset(name, "the settings"), changes or {})
     return parse_model(SimulationSettings, content, "the settings")
 

@@ -158,9 +158,7 @@ class Associator:
 
     def relocalized(self, frame: CameraFrame) -> tuple[CameraPose, Associations] | None:
         """Return the pose of the camera in the map, estimated from one image without a prediction, and the matches.
-
-        Returns None if too few features match for a reliable pose.
-        """
+        Returns None if too few features match for a reliable pose."""
         if len(frame.pixels) == 0 or frame.feature != self.feature or len(self._owners) == 0:
             return None
         points, features = self._match_descriptors(frame)
@@ -177,11 +175,9 @@ class Associator:
         return resection.camera, associations
 
     def _match_descriptors(self, frame: CameraFrame) -> tuple[Integers, Integers]:
-        """Return M matches by descriptors alone, as indices of map points (M,) and of features (M,).
-
-        The point and the feature of a match have mutually the most similar descriptors. They also pass the ratio test
-        against all other points.
-        """
+        """Return M matches by descriptors alone, as indices of map points (M,) and of features (M,). The point and the
+        feature of a match have mutually the most similar descriptors. They also pass the ratio test against all other
+        points."""
         owners, descriptors = self._owners, self._descriptors
         if len(owners) > MANY:
             if self._keyframes is None:
@@ -203,10 +199,8 @@ class Associator:
 
     def _cost_limit(self) -> float:
         """Return the largest distance between descriptors that a match may have, squared unless descriptors are binary.
-
         Only the fraction :data:`CHANCE` of the pairs of different map points has a smaller distance. The result is
-        infinite if the map has too few points to estimate this.
-        """
+        infinite if the map has too few points to estimate this."""
         if len(self._starts) < 3 or len(self._owners) == 0:
             return math.inf
         rows = np.linspace(0, len(self._owners) - 1, min(SAMPLED, len(self._owners))).astype(np.int64)

@@ -68,7 +68,7 @@ def records(space: ScaleSpace, keypoints: Keypoints, *, paper_literal: bool = Fa
 
 
 def values(record: NDArray[np.void]) -> Float:
-    """Return the values (N, 35) by which N features are compared, without unit. ``record`` (N,): see :func:`records`.
+    """Return 35 dimensionless values (N, 35) for the comparison of N features. ``record`` (N,): see :func:`records`.
 
     Responses and textures are divided by their norm, for invariance to contrast. Scale is in octaves. Orientations are
     replaced by their sine, which is continuous where an angle wraps around.

@@ -208,10 +208,8 @@ class KeyframeIndex:
         return np.flatnonzero(alike[self._of])
 
     def _vlad_vectors(self, values: Array, of: Integers) -> Array:
-        """Return the VLAD vectors (K, WORDS * D) of K images. Similar images have similar vectors.
-
-        ``values`` (M, D): descriptors of all images. ``of`` (M,): the index of each descriptor's image.
-        """
+        """Return the VLAD vectors (K, WORDS * D) of K images. Similar images have similar vectors. ``values`` (M, D):
+        descriptors of all images. ``of`` (M,): the index of each descriptor's image."""
         (nearest, _), count = vq(values, self._words), len(self._words)
         descriptions = np.zeros((int(of.max()) + 1, count, values.shape[1]))
         np.add.at(descriptions, (of, nearest), values - self._words[nearest])

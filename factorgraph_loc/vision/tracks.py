@@ -48,9 +48,7 @@ class FeatureTracker:
 
     def follow(self, pixels: Array, descriptors: Descriptors) -> Integers:
         """Return the track numbers (K,) of the K features of the next image. ``pixels`` (K, 2), ``descriptors`` (K, D).
-
-        A number occurs at most once per image. A feature without a match gets a new number.
-        """
+        A number occurs at most once per image. A feature without a match gets a new number."""
         numbers = np.full(len(pixels), -1, dtype=np.int64)
         image = _TrackedImage(undistorted(self._camera, pixels), descriptors, numbers)
         missed = None
@@ -102,10 +100,8 @@ def pairs(first: tuple[Array, Descriptors], second: tuple[Array, Descriptors], c
 
 def _of_one_geometry(first: Float, second: Float, focal: float) -> Truths:
     """Return a mask (M,) of the pairs of pixels that fit one essential matrix. All are True if no matrix can be
-    estimated.
-
-    ``first``, ``second`` (M, 2) [px]: pixels relative to the principal point. ``focal`` [px]: the focal length.
-    """
+    estimated. ``first``, ``second`` (M, 2) [px]: pixels relative to the principal point. ``focal`` [px]: the focal
+    length."""
     matrix = np.diag((focal, focal, 1.0))
     try:
         _, inliers = cv2.findEssentialMat(first, second, matrix, cv2.USAC_FAST, CONFIDENCE, EPIPOLAR, DRAWS)

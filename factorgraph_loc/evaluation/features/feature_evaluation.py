@@ -37,12 +37,13 @@ class Feature:
 
 
 class MatchScores(NamedTuple):
-    """Matching scores of a pair of images. In a mutual match, both features are the nearest neighbour of each other.
+    """Matching scores of a pair of images. A match is correct if both points show the same place and their regions
+    overlap.
 
     ``matching_score``: number of correct mutual matches divided by the smaller number of features in the common part of
-    the images. ``matches``: number of mutual matches with a distance ratio below
-    :data:`~factorgraph_loc.vision.matching.RATIO`. ``precision``: fraction of these ``matches`` that is correct.
-    Without descriptors, ``matches`` is 0 and the other scores are NaN.
+    the images. In a mutual match, both features are the nearest neighbour of each other. ``matches``: number of mutual
+    matches with a distance ratio below :data:`~factorgraph_loc.vision.matching.RATIO`. ``precision``: fraction of these
+    ``matches`` that is correct. Without descriptors, ``matches`` is 0 and the other scores are NaN.
     """
 
     matches: int = 0
@@ -55,12 +56,14 @@ def evaluate(
 ) -> Iterator[dict[str, Any]]:
     """Yield a dictionary of scores of the feature ``what`` for each pair of the first and a later image of a sequence.
 
-    The keys are the fields of :class:`MatchScores` and of
-    :class:`~factorgraph_loc.evaluation.features.repeatability.Repeatability`, and also:
+    Its keys are:
 
     - ``feature``, ``sequence``: their names. ``image``: number of the later image. ``change``: kind of change between
       both images, such as "rotation". ``amount``: size of this change.
     - ``features``: number of features in the later image. ``milliseconds``: time to compute them on one thread.
+    - ``regions``, ``repeatability``, ``strict``: see
+      :class:`~factorgraph_loc.evaluation.features.repeatability.Repeatability`.
+    - ``matches``, ``matching_score``, ``precision``: see :class:`MatchScores`.
 
     ``progress`` is called after each image.
     """

@@ -32,11 +32,9 @@ _NAME = 40  # maximum length of a name at an axis
 
 @dataclass(frozen=True)
 class _Row:
-    """A row of a dot plot, with a label ``name`` and a ``colour``.
-
-    ``values``: the values of a variant (estimator with its settings) on each log. ``mark``: their median or mean, which
-    is marked. ``band``: the expected interval of the mark, or None.
-    """
+    """A row of a dot plot, with a label ``name`` and a ``colour``. ``values``: the values of a variant (estimator with
+    its settings) on each log. ``mark``: their median or mean, which is marked. ``band``: the expected interval of the
+    mark, or None."""
 
     name: str
     colour: str

@@ -262,7 +262,8 @@ def _named(name: str, parts: Sequence[str]) -> str:
 
 
 def short_name(key: str) -> str:
-    """Return the last part of a dotted name, with blanks in place of underscores."""
+    """Return the last part of a dotted name with blanks for underscores: "final.position_rmse" becomes "position
+    rmse"."""
     return key.rpartition(".")[2].replace("_", " ")
 
 

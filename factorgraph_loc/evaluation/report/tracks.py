@@ -71,7 +71,8 @@ def _plain(values: Array) -> list[Any]:
 
 
 def sigma(estimates: Estimates) -> Array:
-    """Return twice the standard deviation (N,) [m] of each position, along the direction in which it is largest."""
+    """Return twice the standard deviation (N,) [m] of each position, along the direction with the largest
+    uncertainty."""
     assert estimates.trajectory.covariances is not None
     xx, xy, yy = (estimates.trajectory.covariances[:, i, j] for i, j in ((0, 0), (0, 1), (1, 1)))
     with np.errstate(invalid="ignore"):

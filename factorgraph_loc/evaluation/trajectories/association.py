@@ -106,7 +106,7 @@ def in_plane(
     """Return the M paired poses ``pair`` of two planar trajectories as three-dimensional poses. Pairs with NaN become
     gaps.
 
-    ``estimate``, ``reference``: the trajectories, of which only ``has_heading`` is used. ``names``: their names.
+    ``estimate``, ``reference``: the trajectories. Only their field ``has_heading`` is used. ``names``: their names.
     ``t0_ns``: absolute time [ns] of t = 0.
     """
     known = np.isfinite(pair.poses[:, 0]) & np.isfinite(pair.truth[:, 0])
@@ -188,8 +188,8 @@ def alignment(estimate: PosePath, reference: PosePath, how: Alignment) -> Simila
 
 
 def _planar(estimate: PosePath, reference: PosePath, how: Alignment) -> Similarity:
-    """Return the least-squares rotation and translation of ``estimate`` in the plane, for the alignments "se2" and
-    "yaw". The heights do not change, except that "yaw" also shifts them by the mean difference from ``reference``."""
+    """Return the least-squares motion of ``estimate`` in the plane, with the alignment "se2" or "yaw". With "yaw",
+    heights are also shifted by the mean difference from ``reference``."""
     points, targets = estimate.positions[:, :2], reference.positions[:, :2]
     for path, places in ((estimate, points), (reference, targets)):
         if np.abs(places - places[0]).max() <= _DEGENERATE * max(1.0, float(np.abs(places).max())):
