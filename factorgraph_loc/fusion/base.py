@@ -101,7 +101,6 @@ def record_each(estimator: Estimator, ticks: Sequence[float]) -> list[PoseEstima
 
 
 def finds_heading(estimator: Estimator) -> bool:
-    """Return True if the estimator can start at a known position with an unknown heading. This includes estimators that
-    can start at an unknown position."""
+    """Return True if the estimator can start with an unknown heading at a known position, or at an unknown position."""
     names = ("supports_unknown_start", "supports_unknown_heading")
     return any(getattr(estimator, name, False) for name in names)

@@ -96,8 +96,8 @@ class Cloud:
         return replace(self, poses=self.poses[some], constants=self.constants[some], log_weights=weights)
 
     def density(self) -> tuple[Cloud, Array]:
-        """Return a kernel density with the same moments as the particles: kernel centres, and the covariance of the
-        kernel.
+        """Return a kernel density with the same moments as the particles. It consists of the kernel centres and the
+        covariance of the kernel.
 
         The centres are the particles, moved towards their mean (Liu, West, in "Sequential Monte Carlo Methods in
         Practice", 2001, eq. 10.3.8). The covariance (3+P, 3+P) is that of the pose's body-frame perturbation and the
@@ -129,8 +129,8 @@ class Cloud:
         return cloud, kernel + _inflated(covariance - explained, lost)
 
     def drawn(self, rows: NDArray[np.int64], kernel: Array, rng: np.random.Generator) -> Cloud:
-        """Return M particles of equal weight, drawn from a kernel density. ``rows`` (M,): the index of the kernel
-        centre of each new particle. ``kernel`` (3+P, 3+P): the covariance of the Gaussian kernel."""
+        """Return M particles of equal weight, drawn from a kernel density with the particles as centres. ``rows`` (M,):
+        the index of the centre of each new particle. ``kernel`` (3+P, 3+P): the covariance of the Gaussian kernel."""
         noise = positive.draws(kernel, len(rows), rng)
         return replace(
             self,
@@ -289,8 +289,8 @@ def weighable(likelihood: Array, log_weights: Array, t: float) -> Array:
 
 
 def effective_size(log_weights: Array) -> float:
-    """Return the effective number of particles, the inverse of the sum of squared weights (Kong, Liu, Wong, 1994).
-    ``log_weights`` (N,): normalised."""
+    """Return the effective number of particles: one divided by the sum of squared weights (Kong, Liu, Wong, 1994).
+    ``log_weights`` (N,): normalised, so that the weights have the sum 1."""
     return float(1.0 / np.sum(np.exp(2.0 * log_weights)))
 
 

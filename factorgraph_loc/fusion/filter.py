@@ -28,7 +28,7 @@ from factors.se2 import Array
 
 
 class FilterSettings(FileModel):
-    """Settings of every filter."""
+    """Settings that all filters have."""
 
     max_delay: Annotated[float, Field(ge=0.0, le=5.0), InUnit("s")] = 0.5
     """largest delay of a measurement; later measurements are counted and ignored"""
@@ -168,11 +168,11 @@ class Filter(Timeline):
 
     @abstractmethod
     def _estimate(self) -> PoseEstimate:
-        """Return the pose, covariance and status of the present state."""
+        """Return the pose, covariance and status of the current state."""
 
     @abstractmethod
     def _record(self) -> Any:
-        """Return the data of the present state that :meth:`trajectory` needs, with an attribute ``t``, the time [s]."""
+        """Return the data of the current state that :meth:`trajectory` needs, with an attribute ``t``, the time [s]."""
 
     def _seek(self, m: Any) -> Any:
         """Return the filter's first state if the measurement ``m`` determines the start pose, otherwise None."""
@@ -254,10 +254,10 @@ class Filter(Timeline):
 
 
 def at_ticks(ticks: Sequence[float], t: Array, poses: Array, body_covariances: Array) -> Trajectory:
-    """Return a trajectory at the times ``ticks`` [s], selected from records at times ``t`` (N,) [s].
+    """Return a trajectory at the times ``ticks`` [s], made from records at the times ``t`` (N,) [s], ascending. The
+    pose at a tick is that of the last record at or before the tick.
 
-    ``poses`` (N, 3), ``body_covariances`` (N, 3, 3): the recorded estimates, with covariances in the body frame. If
-    several records have the same time, the last one is used.
+    ``poses`` (N, 3), ``body_covariances`` (N, 3, 3): the recorded estimates, with covariances in the body frame.
     """
     rows = np.searchsorted(t, np.unique(np.array(ticks)), side="right") - 1
     covariances = se2.body_to_world(poses[rows], body_covariances[rows])

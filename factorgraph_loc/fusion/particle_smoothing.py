@@ -100,9 +100,9 @@ class BackwardSimulation:
         return _moments(poses, extra)
 
     def _step(self, cloud: Cloud, increment: Increment, later: Cloud) -> tuple[Cloud, Array]:
-        """Return a random ancestor from ``cloud`` for each of the M later states ``later``. Also returns the
-        differences (M, 3) between the motions from the ancestors and the odometry. ``increment``: the odometry from
-        ``cloud`` to ``later``."""
+        """Return one particle for each of the M later particles ``later``: the state from which it came, drawn at
+        random from ``cloud``. Also return the differences (M, 3) between the motions in between and the odometry.
+        ``increment``: the odometry from ``cloud`` to ``later``."""
         smooth, kernel = cloud.density()
         # without constants that were added later
         later = replace(later, constants=later.constants[:, : cloud.constants.shape[1]])

@@ -18,9 +18,9 @@ from factorgraph_loc.text import quoted
 class Description:
     """The description of an estimator for users.
 
-    ``about``: one sentence. ``sensors``: the names of the sensor channels that the estimator uses.
-    ``causal``: True if the estimator has estimates during a run. ``smoothed``: True if its final trajectory uses all
-    measurements. ``settings``: all its settings.
+    ``name``: the name of its class. ``about``: one sentence. ``sensors``: the names of the sensor channels that the
+    estimator uses. ``causal``: True if the estimator has estimates during a run. ``smoothed``: True if its final
+    trajectory uses all measurements. ``settings``: all its settings.
     """
 
     name: str

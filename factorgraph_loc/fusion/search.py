@@ -91,8 +91,8 @@ class Search:
         """Process the measurement ``m`` while the pose is unknown. Returns True if the result of the search may have
         changed.
 
-        The result changes if the measurement is informative, or if the particles have processed an observation
-        completely. ``odometry``: the integrated odometry at the time of the measurement.
+        The result changes if ``m`` alone gives information on the pose, or if the particles have processed an
+        observation completely. ``odometry``: the integrated odometry at the time of the measurement.
         """
         sensor, finder = self._sensors.get(m.source), self._finders.get(m.source)
         if sensor is None:
@@ -150,8 +150,8 @@ class Search:
         return self._population is not None and (self._population.waits or self._population.denies(place))
 
     def modes(self, t: float) -> list[Mode]:
-        """Return the hypotheses of the pose at time ``t`` [s], most likely first. The list is empty before the first
-        informative measurement. With a known start position, it is never empty."""
+        """Return the hypotheses of the pose at time ``t`` [s], most likely first. The list is empty as long as no
+        measurement gave information on the pose. With a known start position, it is never empty."""
         now, leading = self._motion.state(t), self._leading
         if leading is None or leading.newest is None or not leading.hypotheses:
             return [] if self.start is None else [self.start.mode(now)]
@@ -172,8 +172,7 @@ class Search:
 
     def sample(self, rng: np.random.Generator, count: int, now: ChainState) -> tuple[Array, ChainState] | None:
         """Return ``count`` random poses (N, 3) from the result of the search, and the integrated odometry at their
-        time. This time is at most that of ``now``, the present odometry. Returns None before the first informative
-        measurement."""
+        time. This time is at most that of ``now``, the current odometry. Returns None if there is no result yet."""
         leading = self._leading
         if leading is None:
             return None

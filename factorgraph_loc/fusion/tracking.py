@@ -313,7 +313,7 @@ class SlipMonitor:
                 self._compared = t
 
     def _are_surprising(self, t: float) -> bool:
-        """Return True if the differences of the last observations from their predictions are larger than random
+        """Return True if the last observations differ more from their predictions than is expected from random
         errors."""
         newest = [surprise(row.correction) for row in self._rows if row.odometry.t >= t - WINDOW / 2.0]
         return sum(newest) > SURPRISING * math.sqrt(len(newest))

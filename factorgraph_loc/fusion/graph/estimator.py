@@ -184,7 +184,7 @@ class Smoother(Timeline):
 
     def forget(self, until: float) -> None:
         """Delete the trajectory before the time ``until`` [s], but nothing in the window of the last ``lag`` seconds.
-        If the setting ``lag`` is "all", nothing is deleted."""
+        If the setting ``lag`` is "all" or not set, nothing is deleted."""
         if isinstance(self._backend, Incremental):
             self._backend.forget(min(until, self._taken_until - self._settings.max_delay))
 
@@ -274,7 +274,7 @@ class Smoother(Timeline):
         return min((m.t for m in self._behind), default=self._t)
 
     def _catch_up(self) -> None:
-        """Process again some of the measurements that wait for it. The computing cost of a call is limited."""
+        """Process again some of the measurements that are queued for this. The computing cost of a call is limited."""
         work = REPLAYED
         while self._behind and work > 0:
             m = self._behind.popleft()

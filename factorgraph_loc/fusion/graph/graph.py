@@ -240,7 +240,8 @@ class Graph:
         return keyframe
 
     def since(self, keyframe: Keyframe, t: float) -> Increment:
-        """Return the motion from a keyframe to time ``t`` [s] by odometry, corrected with its estimated constants."""
+        """Return the motion from a keyframe to time ``t`` [s] by odometry, with the odometry's estimated constants
+        applied."""
         start = keyframe.odometry if self.is_anchored else self.motion.state(keyframe.t)
         return self.recalibrated(self.motion.relative(start, self.motion.state(t)))
 
@@ -268,7 +269,7 @@ class Graph:
         return self.motion.moved(start, times, self.pose, self.covariance, self.value(MOTION, NOTHING_KNOWN))
 
     def between(self, first: Keyframe, last: Keyframe) -> Increment:
-        """Return the motion from keyframe ``first`` to ``last`` by odometry, corrected with its estimated constants."""
+        """Return the motion between two keyframes by odometry, with the odometry's estimated constants applied."""
         return self.recalibrated(self.motion.relative(first.odometry, last.odometry))
 
     @property
@@ -369,8 +370,8 @@ class Graph:
                 del self.keys[name], self.values[key], self.covariances[key]
 
     def report_damping(self, damping: float) -> None:
-        """Add an event to the diagnostics if ``damping``, a prior that was needed to compute covariances, is the
-        largest so far."""
+        """Add an event to the diagnostics if ``damping``, which was needed to compute covariances, is the largest so
+        far."""
         if damping > self._damping:
             self._damping = damping
             self.diagnostics.event(self.t, "damped", DAMPED, damping=damping)

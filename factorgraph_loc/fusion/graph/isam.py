@@ -78,8 +78,8 @@ class Incremental:
         """Return the final poses (M, 3) and body-frame covariances (M, 3, 3) of the keyframes of ``graph``, a copy of
         the graph.
 
-        If the setting ``lag`` is "all", all poses are optimised together. Otherwise poses in the window have their
-        current estimates, and older poses the estimates from when they left the window.
+        If the setting ``lag`` is "all" or not set, all poses are optimised together. Otherwise poses in the window have
+        their current estimates, and older poses the estimates from when they left the window.
         """
         if self._settings.smooth and self._is_whole:
             return solve_whole(graph, self._newest_values(graph), is_guess=self._settings.final_only)
