@@ -43,8 +43,8 @@ class Parameter:
 
 class LikelihoodTerms(NamedTuple):
     """A likelihood and its derivatives at given values of P parameters. ``cost``: the negative log-likelihood of all
-    measurements. ``scores`` (B, P): its gradient for the measurements in each of B time intervals, which add up to the
-    gradient of the cost. ``information`` (P, P): the Fisher information of all measurements."""
+    measurements. ``scores`` (B, P): row b is the gradient of this cost for the measurements in time interval b. The
+    rows add up to the whole gradient. ``information`` (P, P): the Fisher information of all measurements."""
 
     cost: float
     scores: Array

@@ -42,7 +42,7 @@ def odometry_model(rig: Rig, *, use_gyro: bool = False, constants_as_noise: bool
 
     ``use_gyro``: True if the gyro replaces the rotation of the wheels. The noise of the heading is then that of the
     gyro. ``constants_as_noise``: True to add the uncertainty of the calibration constants to the noise. Use this if the
-    constants are not estimated. The added variances are those after the distance :data:`WAY`, the rotation :data:`TURN`
+    constants are not estimated. The added variances are exact after the distance :data:`WAY`, the rotation :data:`TURN`
     and the time :data:`TIME`.
     """
     s = rig.of(OdometrySettings)

@@ -175,8 +175,8 @@ class LandmarkFinder:
     def sample(self, rng: np.random.Generator, count: int) -> Array:
         """Return ``count`` random poses (N, 3) at the last sighting, or (0, 3) before the first sighting.
 
-        Samples are drawn from narrow hypotheses, in proportion to their weights. The remaining samples are drawn from
-        the likelihood of the last sighting (sensor resetting: Lenser, Veloso, ICRA 2000).
+        Samples are drawn from hypotheses with small covariances, in proportion to their weights. The remaining samples
+        are drawn from the likelihood of the last sighting (sensor resetting: Lenser, Veloso, ICRA 2000).
         """
         if self._window is None:
             return np.empty((0, 3))

@@ -325,8 +325,8 @@ class LandmarkSensor(Sensor):
         return True
 
     def _learn(self, observation: LandmarkObservation, view: View) -> None:
-        """Update the estimated fraction and excess of late (too long) ranges. The ``observation`` must include
-        landmarks with range alone."""
+        """Update the estimated fraction and excess of late (too long) ranges from ``observation``, which must include
+        landmarks with range alone. ``view``: the current estimate."""
         self._late_before.append((observation.t, self._late))
         while self._late_before[0][0] < observation.t - GOING_BACK:
             self._late_before.popleft()

@@ -60,8 +60,8 @@ FLOOR = np.array(((0.01, 0.0, 0.0), (0.005, 0.0, 0.0), (0.003, 0.005, 0.0)))
 @dataclass(frozen=True)
 class Windows:
     """M time windows of a log, for comparison of odometry and reference. ``begin``, ``end`` (M,): their first and last
-    time [s]. ``motion`` (M, 3): the motion of the reference in each window, in the robot frame at its first time.
-    ``sigmas`` (M, 3): standard deviations of the errors of the odometry [m, m, rad]."""
+    time [s]. ``motion`` (M, 3): the motion of the reference in each window, in the robot frame at ``begin``. ``sigmas``
+    (M, 3): standard deviations of the errors of the odometry [m, m, rad]."""
 
     log: Log
     begin: Array

@@ -161,8 +161,8 @@ def assemble(rows: Mapping[str, TableRows], reading: Reading) -> Stream:
 
 
 def _with_fix(table: TableRows, warnings: list[Notice]) -> TableRows:
-    """Return the rows with a GNSS fix. Without a fix, receivers report latitude 0 and longitude 0. A warning about such
-    rows is appended to ``warnings``."""
+    """Return the rows of ``table`` with a GNSS fix. Without a fix, receivers report latitude 0 and longitude 0. A
+    warning about the removed rows is appended to ``warnings``."""
     none = (table.numbers["latitude"] == 0.0) & (table.numbers["longitude"] == 0.0)
     if not none.any() or none.all():
         return table

@@ -95,11 +95,11 @@ def whole_scans(log: Log) -> list[RfidScan]:
 
 @dataclass(frozen=True, eq=False)
 class TagEvidence:
-    """The likelihood of a scan for the state of each of U tags, which may be as surveyed, weak, moved or dead.
+    """The likelihood of a scan for the state of each of U tags, which may be as surveyed, weak or moved.
 
     ``tags`` (U,): indices of the tags in the map. ``log_likelihoods`` (U, S): the log-likelihood of the reads and
-    misses of each tag if it is in each of S states, see :meth:`~factors.rfid.tag_states.TagStates.expect`. ``is_read``
-    (U,): True for tags that were read.
+    misses of each tag in each of S states, the rows of :attr:`.TagStates.hypotheses`. It is relative to that of a tag
+    out of range that is never read. ``is_read`` (U,): True for tags that were read.
     """
 
     tags: Integers
@@ -200,8 +200,8 @@ class KnownTags:
         return TagReadCounts(np.zeros((len(used), 3)), used, rounds, hits, odds, elsewhere, tags, prior, twists)
 
     def weigh_states(self, counts: TagReadCounts, pose: Array, covariance: Array, parameters: Array) -> TagEvidence:
-        """Return the likelihood of reads and misses, ``counts``, for each possible state of a tag: as surveyed, weak,
-        moved or dead. It is computed for the tags in range.
+        """Return the likelihood of reads and misses, ``counts``, for each possible state of the tags in range: as
+        surveyed, weak or moved.
 
         ``pose`` (3,) with body-frame ``covariance`` (3, 3): the estimated pose before the scan corrects it.
         ``parameters`` (Q,): the estimated parameters of the read likelihood.

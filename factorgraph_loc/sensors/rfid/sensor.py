@@ -181,7 +181,7 @@ class TagSensor(Sensor):
 
     def _learns(self, t: float) -> bool:
         """Return True if detection models and states of tags may be estimated at ``t`` [s]. Returns False if the pose
-        is new or suspicious, or if the wheels slip."""
+        was recently replaced or is suspicious, or if the wheels slip."""
         return not self._wheels.is_slipping and self.suspicious_since is None and t >= self._confirmed
 
     def _detection(self, m: RfidScan, moved: TagReadCounts, counts: TagReadCounts) -> TagObservation:

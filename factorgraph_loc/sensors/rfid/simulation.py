@@ -132,9 +132,9 @@ def draw_reads(
 ) -> Hits:
     """Return a mask (N, A, T) of random reads of T tags by A antennas in inventory rounds at ``times`` (N,) [s].
 
-    ``probabilities`` (N, A, T): the mean probability of a read over time. ``faults``: the faults to simulate, except
-    those of map and clock. In a fade, tags have only false reads. Outside of fades, their probability is therefore
-    higher. ``dead``: indices of tags that are never read.
+    ``rfid``: the antennas. ``probabilities`` (N, A, T): the mean probability of a read over time. ``faults``: the
+    faults to simulate, except those of map and clock. In a fade, tags have only false reads. Outside of fades, their
+    probability is therefore higher. ``dead``: indices of tags that are never read.
     """
     shape = probabilities.shape
     share = faults.fading.share

@@ -156,8 +156,8 @@ def choose(pairs: TagPairs, floor: Floor, antennas: int, *, facing: bool) -> tup
     """Return the best kind of detection model by cross-validation, and the score of each kind.
 
     The score is the negative log-likelihood [nats per round] of held-out ``pairs``. A more complex model must be better
-    than a simpler one by :data:`WORTH`. ``floor``: probabilities of false reads and misses. ``antennas``: the number of
-    antennas. ``facing``: True if the facing of tags is known.
+    than a simpler one by :data:`WORTH`. ``floor``: minimum probabilities of a read and of a miss. ``antennas``: the
+    number of antennas. ``facing``: True if the facing of tags is known.
     """
     kinds = [Kind("beam"), Kind("logistic"), *([Kind("logistic", facing=True)] if facing else [])]
     if antennas > 1:

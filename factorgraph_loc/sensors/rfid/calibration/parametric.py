@@ -133,7 +133,7 @@ def family_of(model: DetectionModel, pairs: TagPairs) -> Family:
 
 def fit_model(pairs: TagPairs, family: Family, floor: Floor) -> tuple[DetectionModel, Posterior]:
     """Return the maximum a posteriori detection model of a ``family``, and the posterior of its parameters. ``pairs``:
-    reads and misses. ``floor``: probabilities of false reads and misses."""
+    reads and misses. ``floor``: minimum probabilities of a read and of a miss."""
     data = _with_edge_misses(pairs) if family.design else pairs
     design = family.design(data.points, data.facing) if family.design else None
 
@@ -254,8 +254,9 @@ def pose_share(
     floor: Floor,
 ) -> float:
     """Return the Fisher information of the reads on the pose, divided by its value for independent reads. It is below 1
-    because reads in a time window are correlated. ``logs``: rounds that are not merged. ``which``: the index in
-    ``models`` for each antenna. ``floor``: probabilities of false reads and misses."""
+    because reads in a time window are correlated. ``logs``: rounds that are not merged. ``survey``: the transform of
+    the tags to the world frame. ``which``: the index in ``models`` for each antenna. ``floor``: minimum probabilities
+    of a read and of a miss."""
     within = [nearby(log, settings, survey) for log in logs]
     pairs = pairs_of(logs, settings, survey, within, WINDOW)
     logit, columns = modelled(models, which, pairs), []
