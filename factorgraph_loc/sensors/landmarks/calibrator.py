@@ -115,8 +115,8 @@ def _scatter(errors: Array, ranges: Array, weights: Array, start: tuple[float, f
     """Return the standard deviation of ``errors`` (K,) with ``weights`` (K,) as the pair (constant, relative). At range
     r it is sqrt(constant^2 + (relative r)^2). ``ranges`` (K,): measured ranges [m].
 
-    This is one step of Fisher scoring from ``start``, the pair of the previous step (Nelder and Pregibon, "An extended
-    quasi-likelihood function", Biometrika 74(2), 1987).
+    This is one step of Fisher scoring from ``start``, the pair of the previous step. Source: Nelder and Pregibon, "An
+    extended quasi-likelihood function", Biometrika 74(2), 1987.
     """
     design = np.column_stack((np.ones(len(errors)), ranges**2))
     root = np.sqrt(weights) / (design @ np.square(start))

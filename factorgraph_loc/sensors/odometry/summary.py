@@ -86,8 +86,8 @@ def against_reference(log: Log) -> tuple[dict[str, float], list[Notice]]:
 
 
 def _ratio(theirs: Array, ours: Array) -> float | None:
-    """Return the least-squares ratio of ``theirs`` (N,) to ``ours`` (N,), or None if the sum of the squares of ``ours``
-    is at most 1."""
+    """Return the least-squares ratio of ``theirs`` (N,) to ``ours`` (N,). Returns None if the sum of the squares of
+    ``ours`` is at most 1."""
     known = np.isfinite(theirs)
     moved = float(ours[known] @ ours[known])
     return float(ours[known] @ theirs[known]) / moved if moved > 1.0 else None

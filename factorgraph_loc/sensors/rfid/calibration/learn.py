@@ -156,8 +156,9 @@ def relearn_rfid(traced: Sequence[Traced], rig: Rig, first: Rig, grids: Path) ->
 def _mounted(
     traced: Sequence[Traced], settings: RfidSettings, initial: RfidSettings
 ) -> tuple[RfidSettings, list[FittedConstant]]:
-    """Return ``settings`` with the antenna yaws and the time offset that the smoother estimated on the logs ``traced``,
-    and a list of these constants. Constants that the logs do not determine get their value in ``initial``."""
+    """Return ``settings`` with the antenna yaws and the time offset that the smoother estimated, and a list of these
+    constants. ``traced``: the smoothed logs. Constants that the logs do not determine get their value in
+    ``initial``."""
     known, antennas, constants = initial.uncertainties(), dict(settings.all_antennas()), list[FittedConstant]()
     common = corrections_of("rfid.yaw", traced)
     for name, antenna in antennas.items():

@@ -97,8 +97,9 @@ def view_of(log: Rounds, settings: RfidSettings, survey: SurveySettings, pairs: 
     """Return the position and facing (M, 4) of the tag in M pairs, and the horizontal distance (M,) from antenna to tag
     [m].
 
-    The columns are x, y, z of the tag in the antenna frame [m], and the cosine of the angle between the direction of
-    the tag's front and the direction to the antenna. ``pairs`` (M,): indices of pairs, from :func:`nearby`.
+    The columns are x, y, z of the tag in the antenna frame [m], and the cosine of an angle. The angle is that between
+    the direction of the tag's front and the direction to the antenna. ``pairs`` (M,): indices of pairs, from
+    :func:`nearby`.
     """
     row, column = np.divmod(pairs, len(log.names))
     transform = survey.transform()
