@@ -116,7 +116,7 @@ class _Record(NamedTuple):
 
 
 class _View(FilterView):
-    """Gives sensors read access to the EKF's state."""
+    """Gives sensors read access to the current estimates and covariances of the EKF."""
 
     localized = True
     _filter: Ekf

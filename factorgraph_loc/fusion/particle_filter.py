@@ -79,7 +79,7 @@ class ParticleFilterSettings(FilterSettings):
 
 
 class _CloudView(FilterView):
-    """Gives sensors read access to the particle filter's state."""
+    """Gives sensors read access to the current estimates and covariances of the particle filter."""
 
     _filter: ParticleFilter
 

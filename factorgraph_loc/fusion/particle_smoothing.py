@@ -193,9 +193,9 @@ def _draw(
     whitener: Array,
     uniform: Array,
 ) -> Integers:
-    """The compiled loop of :func:`draw_ancestors`. ``whitened`` (P+3, N), ``whitened_later`` (P+3, M): the part
-    of the whitened states that depends on the constants. ``whitener`` (3, 3): the matrix that whitens the pose's error
-    given the constants."""
+    """Return the result of :func:`draw_ancestors`, by a compiled loop. ``whitened`` (P+3, N), ``whitened_later`` (P+3,
+    M): the part of the whitened states, of particles and later states, that depends on the constants. ``whitener``
+    (3, 3): whitens the pose's error given the constants."""
     count = len(predicted)
     size = len(whitened) - 3
     cosine, sine = np.empty(count), np.empty(count)

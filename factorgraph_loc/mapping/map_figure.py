@@ -22,10 +22,10 @@ LABEL = 4  # last characters of a tag's EPC that are shown
 
 
 def tag_figure(log: str, made: MadeTags) -> Figure:
-    """Return a plot of a new map of tags, the map of the log (the given map), and the trajectory.
+    """Return a plot of a new map of tags, the map of the log, and the trajectory.
 
-    It also shows the candidate positions of ambiguous tags, and the given tags that were not located. Labels are the
-    last characters of EPCs. ``log``: the name of the log. ``made``: the new map.
+    It also shows the candidate positions of ambiguous tags, and the tags of the log's map that were not located. Labels
+    are the last characters of EPCs. ``log``: the name of the log. ``made``: the new map.
     """
     out = figure(log, made.made, made.poses, LABEL)
     axis = out.axes[0]
@@ -67,7 +67,7 @@ def dropped_figure(
 
 
 def figure(log: str, made: LandmarkMap, poses: Array, label: int = 0) -> Figure:
-    """Return a plot of a new map of landmarks with 2-sigma ellipses, the given map (of the log), and the trajectory.
+    """Return a plot of a new map of landmarks with 2-sigma ellipses, the map of the log, and the trajectory.
 
     ``log``: the name of the log. ``made``: the new map. ``poses`` (N, 3): the trajectory in the frame of the new map.
     ``label``: the number of last characters of a landmark's name to show, or 0 for the whole name.

@@ -65,7 +65,8 @@ class Entry:
 
     @property
     def distance(self) -> float | None:
-        """Distance [m] between the given and the estimated position, or None if either is missing."""
+        """The distance [m] between the position in the given map (of the log) and the estimated one. None if either is
+        missing."""
         if self.given is None or self.learnt is None:
             return None
         return float(np.hypot(*(self.learnt.position - self.given)))
@@ -93,12 +94,13 @@ class LandmarkMap:
 
     @property
     def unseen(self) -> tuple[str, ...]:
-        """Names of the given landmarks without measurements in the log. The new map has their given positions."""
+        """The names of the landmarks of the log's map that have no measurements in the log. They keep their positions
+        in the new map."""
         return tuple(entry.landmark for entry in self.entries if entry.verdict == UNSEEN)
 
     @property
     def flagged(self) -> tuple[str, ...]:
-        """Names of the landmarks whose given position is wrong."""
+        """The names of the landmarks with a wrong position in the log's map."""
         return tuple(entry.landmark for entry in self.entries if entry.flagged)
 
     def summary(self, what: str = "landmarks") -> str:
@@ -113,7 +115,7 @@ class LandmarkMap:
 
 @dataclass(frozen=True)
 class Alignment:
-    """The alignment of a new map with a given map.
+    """The alignment of a new map with the map of the log (the given map).
 
     ``pose`` (3,): x, y and angle of the transform from the new map's frame to the given map's frame. ``covariance``
     (3, 3): of this transform. ``inliers``: the number of landmarks that agree. ``factor``: the number by which the
@@ -173,9 +175,9 @@ def make_map(
 
 
 def align_robustly(points: list[LearntPoint], targets: Array, surveys: Array) -> Alignment:
-    """Return the robust alignment of K estimated landmarks with their given positions. A minority of wrong given
-    positions does not affect it. ``points``: the estimates. ``targets`` (K, 2), ``surveys`` (K, 2, 2): the given
-    positions and their covariances. K must be at least ``MIN_COMMON``."""
+    """Return the robust alignment of K estimated landmarks with the log's map, in which a minority of positions may be
+    wrong. ``points``: the estimates. ``targets`` (K, 2), ``surveys`` (K, 2, 2): the positions in the log's map and
+    their covariances. K must be at least ``MIN_COMMON``."""
     positions = np.array([p.position for p in points])
     covariances = np.array([p.covariance for p in points])
     count = len(points)
@@ -225,8 +227,8 @@ def _pairs(count: int) -> list[list[int]]:
 
 
 def _moved(point: LearntPoint, alignment: Alignment) -> LearntPoint:
-    """Return an estimated point, transformed to the frame of the given map. Its covariance includes the covariance of
-    the ``alignment``."""
+    """Return an estimated point, transformed to the frame of the log's map by ``alignment``. Its covariance includes
+    that of the alignment."""
     turn = _rotation(alignment.pose)
     (jacobian,) = _by_alignment(alignment.pose, point.position[None])
     covariance = alignment.factor * turn @ point.covariance @ turn.T + jacobian @ alignment.covariance @ jacobian.T
@@ -249,7 +251,8 @@ def _by_alignment(pose: Array, positions: Array) -> Array:
 
 
 def _differ(point: LearntPoint, landmark: Landmark) -> bool:
-    """Return True if the positions of an estimated point and of a given landmark differ significantly."""
+    """Return True if the estimated position ``point`` and the position of ``landmark`` in the log's map differ
+    significantly."""
     error = point.position - np.array((landmark.x, landmark.y))
     covariance = point.covariance + landmark.spread()
     return bool(np.hypot(*error) > TOLERANCE and error @ np.linalg.solve(covariance, error) > GATE)

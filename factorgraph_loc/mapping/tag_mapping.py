@@ -50,7 +50,8 @@ class MadeTags:
 
     @property
     def rms(self) -> float | None:
-        """Root mean square distance [m] between given and estimated positions, None if no tag has both."""
+        """The root mean square distance [m] between estimated tags and their positions in the log's map. None if there
+        are none."""
         distances = [e.distance for e in self.made.entries if e.distance is not None and e.verdict != "given"]
         return float(np.sqrt(np.mean(np.square(distances)))) if distances and self.made.judged else None
 
@@ -162,7 +163,8 @@ def _why(posterior: TagPosterior, reads: int) -> Notice:
 
 
 def _as_landmark(log: Log, name: str, position: Array) -> Landmark:
-    """Return a given tag as a landmark in the world frame. ``position`` (2,): its position in the world frame."""
+    """Return the tag ``name`` of the log's map as a landmark in the world frame. ``position`` (2,): its position in
+    this frame."""
     tag = log.world.tags[name]
     x, y = position.tolist()
     if tag.covariance is None:
@@ -183,8 +185,8 @@ def _turned(covariance: Array, angle: float) -> tuple[float, float, float]:
 def _world(
     log: Log, observations: TagObservations, made: LandmarkMap, facing: Mapping[str, float], *, in_given_frame: bool
 ) -> World:
-    """Return the map as written to a file: estimated tags in the survey frame (rig section ``[survey]``), given ones
-    unchanged.
+    """Return the map as written to a file. Estimated tags are in the survey frame (rig section ``[survey]``), other
+    tags of the log's map are unchanged.
 
     ``made``: the map in the world frame. ``facing``: by EPC, the direction [rad] of an estimated tag's front in the
     world frame. ``in_given_frame``: True if the new map has the frame of the log's map.

@@ -318,10 +318,9 @@ class _Problem:
 
 
 def _keyframes(begin: float, end: float, stamps: Array) -> Array:
-    """Return the times [s] of keyframes at intervals of ``INTERVAL`` from ``begin`` to ``end``.
-
-    Times inside of long gaps between ``stamps`` [s] are left out, except the last time before the end of a gap.
-    """
+    """Return the times [s] of keyframes at intervals of ``INTERVAL`` from ``begin`` to ``end``. ``stamps`` [s]: the
+    times of measurements. Times inside of long gaps between these are left out, except the last time before the end of
+    a gap."""
     measured = np.unique(np.concatenate(((begin, end), stamps[(stamps > begin) & (stamps < end)])))
     gaps = np.flatnonzero(np.diff(measured) > TICK_GAP)
     firsts = np.append(0, ((measured[gaps + 1] - begin) / INTERVAL).astype(np.int64))

@@ -83,8 +83,8 @@ class ActiveMcl:
             self._search.look(measurement, self._motion.state(measurement.t))
 
     def see(self, sensor: ProximitySensor, lengths: Array) -> None:
-        """Weight the particles by the free ``lengths`` (D,) [m] that a proximity sensor measured. The call has no
-        effect before the particles have processed a measurement of another sensor."""
+        """Weight the particles by the distances ``lengths`` (D,) [m] to walls that a proximity sensor measured. The
+        call has no effect before the particles have processed a measurement of another sensor."""
         self._search.queue(ProximityReading(sensor, lengths), self._motion.state(self._t))
         self._search.advance(self._t)
 

@@ -301,7 +301,8 @@ def _estimator(name: str, setup: model_setup.Setup, settings: ActiveSettings) ->
 
 
 def _start(plan: Plan, world: World, space: FreeSpace, settings: ActiveSettings, rng: np.random.Generator) -> Array:
-    """Return the true start pose (3,): the setting ``start``, or a random pose in free space if it is not set."""
+    """Return the true start pose (3,): the setting ``start``, or a random pose in ``space`` if it is not set. Raises
+    InputError if the setting is not in free space."""
     place = space.centres[rng.integers(len(space.centres))] + CELL * (rng.random(2) - 0.5)
     drawn = np.array((*place, rng.uniform(-math.pi, math.pi)))
     if settings.start is None:

@@ -122,8 +122,9 @@ class LocalBundle:
     pixels: Array
 
     def linearize(self, state: State) -> tuple[Array, Array, Array]:
-        """Return the whitened residuals (M, 2) of the pixels at ``state``, with robust weights, and their Jacobian.
-        Also return the squared whitened residuals (M,) without weights."""
+        """Return the whitened residuals (M, 2) of the pixels at ``state``, with robust weights. Also return their
+        Jacobian (M, 2, 16) by pose, tilt, point and camera constants, and the squared whitened residuals (M,) without
+        weights."""
         poses, tilts, points = state
         at = poses[self.frames], tilts[self.frames], points[self.owners], self.pixels
         model = self.model

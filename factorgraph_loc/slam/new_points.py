@@ -119,8 +119,8 @@ class NewPoints:
     ) -> list[tuple[Hashable, TriangulatedPoint, list[PointSighting]]]:
         """Return (name, point, consistent observations) for the points among ``names`` that can be triangulated.
 
-        The observations of a returned point are deleted. ``places``: returns the camera pose of the keyframe with an
-        index, or None if observations from this keyframe must not be used. ``most``: the largest number of results.
+        The observations of a returned point are deleted. ``places(index)``: returns the camera pose of a keyframe, or
+        None if observations from this keyframe must not be used. ``most``: the largest number of results.
         """
         determined: list[tuple[Hashable, TriangulatedPoint, list[PointSighting]]] = []
         known: dict[int, KeyframeCamera | None] = {}

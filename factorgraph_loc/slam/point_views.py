@@ -106,8 +106,8 @@ class PointViews:
             self._earlier.pop(point, None)
 
     def map_of(self, names: Sequence[str], keys: Sequence[int], positions: Array, covariances: Array) -> PointMap:
-        """Return a map of N points with their last views. ``names``, ``keys``, ``positions`` (N, 3), ``covariances``
-        (N, 3, 3): the data of the points, in the order of the returned map."""
+        """Return a map of N points, each with its last view. ``names``, ``positions`` (N, 3), ``covariances``
+        (N, 3, 3): of the points. ``keys``: their keys in the graph."""
         views = [(i, self._views[key]) for i, key in enumerate(keys) if key in self._views]
         return self._with_views(PointMap.of(tuple(names), positions, covariances), views)
 

@@ -68,8 +68,9 @@ def moved_since(keyframes: Mapping[int, Keyframe], newest: Keyframe, t: float, m
 def _evidence(
     model: CameraModel, pose: Array, covariances: tuple[Array, Array], observed: tuple[Array, Array, Array, Array]
 ) -> float:
-    """Return the log-likelihood ratio of an image for two ``covariances`` (3, 3) of the predicted ``pose`` (3,), the
-    second relative to the first. Returns 0 if too few points agree. ``observed``: see :func:`unless_slipped`."""
+    """Return the log-likelihood ratio of an image for two ``covariances`` (3, 3) of the predicted ``pose`` (3,), second
+    to first. Returns 0 if too few points agree. ``observed``: positions (K, 3) and pixels (K, 2) of points, and the
+    covariances of both."""
     points, pixels, of_points, noise = observed
     agrees = agreeing(model, lifted(model, pose, covariances[1]), points, pixels, noise)
     if np.count_nonzero(agrees) < ENOUGH:

@@ -116,8 +116,8 @@ class AtTheEnd:
         newest.causal = graph.pose, graph.covariance
 
     def attach(self, keyframe: Keyframe, addition: Addition, guess: Guess | None) -> None:
-        """Store the initial values of new variables. ``addition``: new factors and variables at ``keyframe``.
-        ``guess``: the estimated pose and covariance of this keyframe, or None if it is not the newest keyframe."""
+        """Store the initial values of the new variables in ``addition``. ``guess``: the estimated pose and covariance
+        of ``keyframe``, or None if it is not the newest keyframe."""
         self._guesses |= addition.values
         if guess is not None:
             keyframe.causal = self._graph.pose, self._graph.covariance = guess
