@@ -152,7 +152,8 @@ def running_mean(t: Array, values: Array, weights: Array) -> tuple[Array, Array]
 
 
 def _nees(axis: Axes, kind: str, trajectory: Trajectory | None, reference: Trajectory, max_gap: float) -> None:
-    """Plot the NEES of a trajectory. ``kind``: "causal" or "final", for labels. ``max_gap`` [s]: see :class:`Track`."""
+    """Plot the NEES of a trajectory. ``kind``: "causal" or "final", for labels. ``max_gap`` [s]: errors are not
+    interpolated across longer gaps."""
     dof = 3 if reference.has_heading else 2
     axis.set(title=f"{kind} poses", ylabel="NEES of x, y, heading" if dof == 3 else "NEES of x, y", yscale="log")
     low, high = chi_squared.quantile(_TAILS, dof)

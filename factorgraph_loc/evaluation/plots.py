@@ -263,8 +263,8 @@ def _band(axis: Axes, trajectory: Trajectory, e: Errors, row: int) -> None:
 
 
 def _extent(e: Errors, trajectory: Trajectory, row: int) -> float:
-    """Return the upper end of the y axis of a plot of :func:`_band`, which shows 99.5 % of the errors and band limits.
-    The lower end is its negative. ``row``: the component of the errors, as in :func:`_band`."""
+    """Return the upper end of the y axis of a plot of errors and 2-sigma bands. The lower end is its negative. The axis
+    shows 99.5 % of the errors ``e`` and band limits. ``row``: the component, 0 for x, 1 for y, 2 for the heading."""
     values = np.abs(e.difference[:, row])
     if trajectory.covariances is not None:
         values = np.concatenate((values, 2.0 * np.sqrt(trajectory.covariances[:, row, row])))

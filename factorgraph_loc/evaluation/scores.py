@@ -41,7 +41,8 @@ class Metric:
         return significant(self.factor * value, sign=sign)
 
     def range(self, least: float, most: float, *, sign: bool = False) -> str:
-        """Return the range from ``least`` to ``most`` as text for a report. ``sign``: see :meth:`text`."""
+        """Return the range from ``least`` to ``most`` as text for a report. ``sign``: whether positive values have a
+        plus sign."""
         return f"{self.text(least, sign=sign)} … {self.text(most, sign=sign)}"
 
 

@@ -28,7 +28,8 @@ def by_text(rows: Sequence[Row]) -> dict[str, list[Row]]:
 
 
 def lines(rows: Sequence[Row]) -> list[str]:
-    """Return each distinct warning of the runs, with the names of the estimators if only some on a log have it."""
+    """Return the text of each distinct warning of the runs. If only some of the estimators on a log have the warning,
+    their names are appended."""
     texts = []
     for text, concerned in by_text(rows).items():
         logs = {row["log"] for row in concerned}

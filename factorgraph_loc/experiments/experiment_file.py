@@ -194,7 +194,7 @@ class Experiment(FileModel):
 
     ``name``: name of the experiment. ``out``: folder of the results, None for out/NAME. ``logs``, ``estimators``: every
     estimator runs on every log. ``sensors``: sets of used sensors. Runs are made with each set. A set of None means all
-    sensors of the log's rig. ``prior``: prior of the start, see
+    sensors of the log's rig. ``prior``: the start pose, such as "log" or "unknown", see
     :func:`~factorgraph_loc.experiments.preparation.resolve_prior`. ``seeds``: random seeds of the estimators.
     ``max_gap`` [s]: for scores, estimates are not interpolated across longer gaps. ``tick_gap`` [s]: in longer gaps
     between measurements there are no estimates. ``align``: there are also scores after this alignment with the
@@ -278,7 +278,8 @@ def read_experiment(path: Path, changes: Mapping[str, Any] | None = None) -> Exp
 
 
 def _change(content: dict[str, Any], key: str, value: Any, source: object) -> None:
-    """Set the value of a dotted ``key`` in the content of a file, see :func:`read_experiment`. ``source``: its name."""
+    """Set the value of a dotted ``key``, such as "smoother.lag", in the ``content`` of a file. ``source``: name of the
+    file."""
     first, _, rest = key.partition(".")
     if first in Experiment.model_fields:
         set_key(content, key, value, source)

@@ -185,11 +185,11 @@ class GivenSource(LogSource):
 
 
 def recorded_sources(name: str, folder: Path, **options: Any) -> list[RecordedSource]:
-    """Return the sources of the logs with a name in an experiment file.
+    """Return the sources of the logs that an experiment file refers to by ``name``.
 
     ``name``: a name that ``fgloc datasets`` lists, a path relative to ``folder``, or a glob of names or paths.
-    ``options``: values of other fields of :class:`RecordedSource`. Raises InputError if a glob matches no log, or if a
-    path leads out of ``folder`` and of the data folder.
+    ``options``: values of other fields of :class:`RecordedSource`, such as ``rig``. Raises InputError if a glob matches
+    no log, or if a path leads out of ``folder`` and of the data folder.
     """
     known = manifests()
     if name in known:

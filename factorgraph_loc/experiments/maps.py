@@ -291,8 +291,8 @@ def _uses_reference(options: MapOptions, *, has_reference: bool) -> bool:
 
 
 def _started_exactly(log: Log, prior: str | None) -> tuple[Log, str]:
-    """Return the log with a start pose that is known exactly, and a description of the start. ``prior``: as in
-    :class:`MapOptions`. The start is exact, because it defines the frame of the map."""
+    """Return the log with a start pose that is known exactly, and a description of the start. ``prior``: the requested
+    start, such as "log", or None. The start is exact, because it defines the frame of the map."""
     start, source = resolve_prior(log, prior)
     if start is None:
         t, pose, source = first_odometry(log), np.zeros(3), "the first pose is the origin (0, 0, 0)"

@@ -49,11 +49,10 @@ TABLES = ("results.csv", "differences.csv", "table.md")
 def write_run(
     result: RunResult, log: Log, out: Path, *, align: Alignment = "none", overwrite: bool = False
 ) -> dict[str, Any]:
-    """Score a run, write its files into the folder ``out``, and return the scores.
+    """Score a run, write its files into the folder ``out``, and return {key: score}.
 
-    ``align``: see :func:`~factorgraph_loc.evaluation.metrics.score`. The files are written to a temporary folder first.
-    Other files in ``out`` are not changed. Raises InputError if ``out`` contains results and ``overwrite`` is not set.
-    Files:
+    ``align``: alignment for additional scores, such as "se2". The files are written to a temporary folder first. Other
+    files in ``out`` are not changed. Raises InputError if ``out`` contains results and ``overwrite`` is not set. Files:
 
     - ``final.tum``, ``causal.tum``: trajectories. The latter starts when the robot is localized first.
     - ``estimates.parquet``: a row for each tick (time of an estimate, every 0.1 s) and ``kind`` of trajectory (causal,
@@ -68,7 +67,7 @@ def write_run(
     - ``innovations.parquet``: for each update the ``sensor``, the timestamp ``t_ns``, the normalised innovation squared
       ``nis`` and its degrees of freedom ``dof``.
     - ``metrics.json``: the scores. ``config.toml``: the configuration of the run.
-    - ``map.world.toml`` and a file of points: see :func:`map_of`. They are written if the run learnt points.
+    - ``map.world.toml`` and a file of points: the map with the points that the run estimated, if it estimated any.
     """
     require_free(out, FILES, overwrite=overwrite)
     scores = score(result, log, align)
@@ -92,9 +91,9 @@ def write_run(
 def save_run(
     result: RunResult, log: Log, out: Path, *, align: Alignment = "none", overwrite: bool = False
 ) -> dict[str, Any]:
-    """Write the files of a run into the folder ``out``, and return the scores by key, as :func:`write_run`. If writing
-    fails, write them to a new temporary folder, and raise an InputError that names it. ``align``: alignment for
-    additional scores. ``overwrite``: whether existing results may be replaced."""
+    """Write the files of a run into the folder ``out``, and return {key: score}. If that fails, write them to a new
+    temporary folder instead, and raise an InputError that names it. ``align``: alignment for additional scores, such as
+    "se2". ``overwrite``: whether existing results may be replaced."""
     try:
         return write_run(result, log, out, align=align, overwrite=overwrite)
     except InputError as error:
@@ -171,7 +170,8 @@ def remove_run(out: Path) -> None:
 
 
 def estimates(result: RunResult, log: Log) -> pl.DataFrame:
-    """Return the table of ``estimates.parquet``; see :func:`write_run`."""
+    """Return a table of poses, covariances and errors, with a row for each tick and ``kind`` of trajectory. The columns
+    are described in :func:`write_run`."""
     flags = pl.DataFrame(
         {"status": list(result.status), "doubts_model": list(result.doubts_model) or [False] * len(result.status)},
         {"status": pl.String, "doubts_model": pl.Boolean},
@@ -187,7 +187,8 @@ def estimates(result: RunResult, log: Log) -> pl.DataFrame:
 
 
 def learnt_tables(learnt: Learnt) -> dict[str, Any]:
-    """Return the content of ``learnt.json``; see :func:`write_run`."""
+    """Return the estimated constants and landmarks as {"constants": {name: {...}}, "landmarks": {name: {...}}} for
+    JSON. The inner keys are described in :func:`write_run`."""
     constants = {name: {"value": value, "sigma": sigma} for name, (value, sigma) in learnt.values.items()}
     landmarks = {}
     for name, point in learnt.landmarks.items():
@@ -198,13 +199,15 @@ def learnt_tables(learnt: Learnt) -> dict[str, Any]:
 
 
 def events(result: RunResult, log: Log) -> pl.DataFrame:
-    """Return the table of ``events.csv``; see :func:`write_run`."""
+    """Return a table of the events of a run. Columns: timestamp ``t_ns``, time ``t`` [s] since the log's start,
+    ``event``."""
     rows = [(log.t0_ns + round(e.t * 1e9), e.t, str(e)) for e in result.diagnostics.events]
     return pl.DataFrame(rows, schema={"t_ns": pl.Int64, "t": pl.Float64, "event": pl.String}, orient="row")
 
 
 def innovations(result: RunResult, log: Log) -> pl.DataFrame:
-    """Return the table of ``innovations.parquet``; see :func:`write_run`."""
+    """Return a table of the normalised innovation squared (NIS) of each update. The columns are ``sensor``, timestamp
+    ``t_ns``, ``nis``, and its degrees of freedom ``dof``."""
     updates = sorted(result.diagnostics.nis.items())
     rows = [(sensor, log.t0_ns + round(t * 1e9), nis, dof) for sensor, rows in updates for t, nis, dof in rows]
     schema = {"sensor": pl.String, "t_ns": pl.Int64, "nis": pl.Float64, "dof": pl.Float64}
@@ -271,7 +274,7 @@ def run_files(result: RunResult, log: Log, started: float, align: Alignment = "n
 
 
 def write_tables(table: pl.DataFrame, differences: pl.DataFrame, text: str, out: Path) -> None:
-    """Write :data:`TABLES` into ``out``: the runs (``table``), ``differences`` of methods, and ``text`` (table.md)."""
+    """Write the runs (``table``), the ``differences`` of methods, and ``text`` (table.md) into the folder ``out``."""
     write_text(out / "results.csv", plain_lines(table.write_csv()))
     write_text(out / "differences.csv", plain_lines(differences.write_csv()))
     write_text(out / "table.md", plain_lines(text))

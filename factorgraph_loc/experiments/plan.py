@@ -55,8 +55,7 @@ class PlannedRun(RunConfig):
 
     @property
     def columns(self) -> dict[str, Any]:
-        """The first columns of the run's row in the table of results, see
-        :func:`~factorgraph_loc.experiments.result_table.load_results`."""
+        """{name: value} of the first columns of the run's row in the table of results, such as label, log and seed."""
         return {
             "label": self.label,
             "log": self.log,

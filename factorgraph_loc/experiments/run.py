@@ -99,7 +99,7 @@ def run(
 
 
 def _use(log: Log, config: RunConfig) -> Use:
-    """Return the sensors and settings of a run. Raises InputError if the log or the configuration is out of bounds."""
+    """Return the log, sensors and settings of a run. Raises InputError if the log or the configuration is invalid."""
     check_max_gap(config.max_gap)
     check_tick_gap(config.tick_gap)
     require_bounds(log)  # no reader has checked a log that was made by a program

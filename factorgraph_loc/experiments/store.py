@@ -54,7 +54,7 @@ class RunManifest(StoredFile):
 
 
 class Failure(StoredFile):
-    """The content of ``failure.json``, which explains why a run failed. ``kind``: such as "timeout"."""
+    """The content of ``failure.json``. ``kind``: such as "timeout". ``reason``: a sentence about why the run failed."""
 
     kind: str
     reason: str
@@ -139,7 +139,8 @@ class Store:
         """Return the columns of a run for the table of results, as {name: value}.
 
         They are ``status`` (ok, failed), ``kind`` and ``reason`` of a failure, and ``warnings`` (one per line). Scores
-        and times that are single numbers are columns too. Raises DamagedError as :meth:`read`.
+        and times that are single numbers are columns too. Raises DamagedError if a file is missing or has a wrong
+        checksum.
         """
         return self._row(self._manifest(key))
 

@@ -38,8 +38,8 @@ class Log:
 
     ``rig``: the robot and its sensors. ``world``: the map. ``streams``: the measurements, by the name of the sensor.
     ``reference``: the reference trajectory, or None. ``start``: the known start, or None. ``t0_ns``: absolute time of t
-    = 0 [ns]. ``warnings``: problems that the reader corrected or skipped. ``metadata``: licence, origin and other texts
-    by key, see :data:`NOT_READ` and :data:`RIG_NOTES`.
+    = 0 [ns]. ``warnings``: problems that the reader corrected or skipped. ``metadata``: {key: text}, such as the
+    licence, the origin, and columns that were not read.
     """
 
     name: str
@@ -130,8 +130,8 @@ class Log:
 
 
 def _pieces(rows: Rows, late: Integers, first: int, last: int) -> Iterator[Rows]:
-    """Yield ``rows`` from index ``first`` to before ``last`` in parts. Each row with an index in ``late`` is a part of
-    its own."""
+    """Yield ``rows`` with the indices ``first`` to ``last`` - 1 in parts. A row with an index in ``late`` is one part.
+    All rows between two such rows are also one part."""
     for i in late[late.searchsorted(first) : late.searchsorted(last)].tolist() if len(late) else ():
         if first < i:
             yield rows.part(first, i)

@@ -130,7 +130,7 @@ class PosePath(Exchange):
         return self.t_ns
 
     def seconds(self) -> Array:
-        """Return the times (N,) in seconds since 1970, rounded to the nearest float. For errors see :meth:`stamps`."""
+        """Return the times (N,) in seconds since 1970. Raises InputError if times are unknown or do not increase."""
         return np.array([t / 10**9 for t in self.stamps().tolist()])
 
     def rows(self, which: Integers) -> PosePath:

@@ -83,7 +83,8 @@ class Rig(FileModel):
         return settings
 
     def of(self, kind: type[S], section: str | None = None) -> S:
-        """Return the settings of class ``kind``, as :meth:`find` does. Raises InputError if the rig lacks them."""
+        """Return the settings of class ``kind``. Raises InputError if the rig lacks them. ``section``: the name of the
+        section, needed if several sections have this class."""
         settings = self.find(kind, section)
         if settings is None:
             raise InputError(f"the rig {self.name} has no [{section or _SECTIONS[kind]}]")

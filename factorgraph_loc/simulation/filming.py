@@ -144,7 +144,8 @@ def _write_in_parallel(
     progress: Callable[[float, float], None],
 ) -> None:
     """Render ``count`` images by ``workers`` processes, and write them into ``folder``. Each process creates the scene
-    and renders every n-th image, where n is the number of processes. ``progress``: see :func:`with_images`."""
+    and renders every n-th image, where n is the number of processes. ``progress``: called with the numbers of finished
+    and of all images."""
     write = partial(_write, settings, seed, folder)
     parts = [range(i, count, workers) for i in range(workers)]
     for _, outcome in run_each(

@@ -220,8 +220,12 @@ def _shade(
     rotation: Array,
     pixel_at_one: float,
 ) -> tuple[int, np.float32, np.float32, np.float32]:
-    """Return the index of the face that the ray (x, y, 1) in the camera frame hits, and the BGR colour there. The other
-    arguments are those of :func:`cast` and :func:`expose`."""
+    """Return the index of the face that the ray (x, y, 1) in the camera frame hits, and the BGR colour there.
+
+    ``table``, ``starts``, ``items``, ``place``: the faces and the camera, see :func:`cast`. ``texels``, ``layout``: the
+    textures. ``rotation`` (3, 3): from camera to world. ``pixel_at_one``: the size of a pixel at a depth of 1 m, in
+    texels.
+    """
     x0, y0, z0, _, per_width, per_depth = place
     dx = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2]
     dy = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2]

@@ -217,11 +217,9 @@ def _numbers(descriptors: Descriptors) -> Float:
 
 
 def _gates(covariances: Array) -> tuple[Array, Array]:
-    """Return the elliptic gates of C predicted pixels.
-
-    Returns the matrices A (C, 2, 2) of the ellipses x'Ax = 1 around the pixels, and their largest radii (C,) [px].
-    ``covariances`` (C, 2, 2) [px^2]: of the innovations, measured minus predicted pixel.
-    """
+    """Return elliptic gates around C predicted pixels. A measured pixel is accepted if it lies in the gate. Returns the
+    matrices A (C, 2, 2) of the ellipses x'Ax = 1, and their largest radii (C,) [px]. ``covariances`` (C, 2, 2) [px^2]:
+    of the innovations, measured minus predicted pixel."""
     gates = GATE * covariances
     mean = 0.5 * (gates[:, 0, 0] + gates[:, 1, 1])
     half = np.hypot(0.5 * (gates[:, 0, 0] - gates[:, 1, 1]), gates[:, 0, 1])

@@ -36,7 +36,7 @@ class Weights:
     map: Float
 
     def __call__(self, values: Float) -> Float:
-        """Return descriptors (N, 35) of unit length. ``values`` (N, 35): see
+        """Return descriptors (N, 35) of unit length. ``values`` (N, 35): dimensionless values of N features, from
         :func:`~factorgraph_loc.vision.descriptor.values`."""
         mapped = (values - self.mean) @ self.map
         length = np.linalg.norm(mapped, axis=1, keepdims=True)

@@ -36,9 +36,9 @@ Shapes = tuple[tuple[int, ...], tuple[int, ...]]  # height, width, ... of both i
 class Repeatability(NamedTuple):
     """Repeatability scores of a pair of images, from 0 to 1. A region is the image area that a keypoint describes.
 
-    ``regions``: the number of regions in the common part of both images; the smaller of the counts in both images.
-    ``repeatability``: number of corresponding regions (:func:`overlaps`) divided by ``regions``. ``strict``: number of
-    regions that also have similar sizes (:func:`alike_regions`), divided by ``regions``. Without regions both are 0.
+    ``regions``: the smaller of the two numbers of regions in the part of the scene that both images show.
+    ``repeatability``: number of corresponding regions (overlap error below 0.4) divided by ``regions``. ``strict``:
+    number of regions that also have similar sizes, divided by ``regions``. Without regions all are 0.
     """
 
     regions: int
@@ -50,8 +50,8 @@ class Repeatability(NamedTuple):
 class Candidates:
     """M pairs of regions in two images that may correspond. ``first``, ``second`` (M,): indices of the regions.
 
-    ``error`` (M,): overlap error. ``ratio`` (M,): size of the second region after mapping to the first image, divided
-    by the size of the first region.
+    ``error`` (M,): overlap error, 1 - intersection / union. ``ratio`` (M,): size of the second region after mapping to
+    the first image, divided by the size of the first region.
     """
 
     first: Integers

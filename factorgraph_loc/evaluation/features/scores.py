@@ -58,7 +58,7 @@ def evaluate_all(
 
 
 def write_scores(scores: pl.DataFrame, out: Path) -> None:
-    """Write :data:`FILES` into the folder ``out``: tables in Markdown, the table ``scores`` of all pairs, a plot."""
+    """Write tables in Markdown, the table ``scores`` of all pairs of images, and a plot into the folder ``out``."""
     with writing(out):
         out.mkdir(parents=True, exist_ok=True)
         write_text(out / "table.md", tables(scores))
@@ -70,7 +70,7 @@ def summary(scores: pl.DataFrame) -> tuple[list[str], list[list[str]]]:
     """Return the header and the rows of a table of the mean scores of each feature over all pairs of images.
 
     Times are medians, because other processes cause outliers. A dash means that the feature does not have the score.
-    ``scores``: see :func:`evaluate_all`.
+    ``scores``: a row for each pair of images and feature, from :func:`evaluate_all`.
     """
     lines = []
     for name in scores["feature"].unique(maintain_order=True):

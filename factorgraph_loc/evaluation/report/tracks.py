@@ -82,7 +82,7 @@ def sigma(estimates: Estimates) -> Array:
 def thinned(estimates: Estimates, count: int) -> dict[str, list[float | None]]:
     """Return about ``count`` selected poses of a trajectory, as lists of rounded numbers. Unknown numbers are None.
 
-    The lists are ``t`` [s], ``x``, ``y`` [m], ``e`` (position error [m]) and ``s`` (see :func:`sigma`). The trajectory
+    The lists are ``t`` [s], ``x``, ``y`` [m], ``e`` (position error [m]) and ``s`` (:func:`sigma` [m]). The trajectory
     is divided into intervals, and the poses with the smallest and the largest error of each interval are selected.
     """
     error, trajectory = estimates.errors["error_position"], estimates.trajectory
@@ -96,7 +96,7 @@ def thinned(estimates: Estimates, count: int) -> dict[str, list[float | None]]:
 
 
 def quantiles(errors: Sequence[Array]) -> Array:
-    """Return the quantiles (51,) at :data:`LEVELS` of the pooled errors of several runs. Empty without errors."""
+    """Return quantiles (51,) of the pooled errors of several runs, from minimum to maximum. Empty without errors."""
     known = _known(np.concatenate(errors)) if errors else np.empty(0)
     return np.quantile(known, LEVELS) if len(known) else known
 

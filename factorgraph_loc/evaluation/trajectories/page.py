@@ -173,7 +173,7 @@ def write_score(score: TrajectoryScore, out: Path) -> None:
     """Write the report of a comparison into the folder ``out``. Files of a previous report are replaced.
 
     The files are ``errors.csv`` (a row for each pair of poses), ``report.html``, the plots as PNG in ``plots``, and
-    ``score.json`` (see :meth:`TrajectoryScore.document`).
+    ``score.json`` (settings, statistics, alignment and warnings).
     """
     with writing(out):
         (out / "plots").mkdir(parents=True, exist_ok=True)

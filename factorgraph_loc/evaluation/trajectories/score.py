@@ -86,9 +86,9 @@ class TrajectoryScore:
     def figures(self) -> dict[str, float | None]:
         """All statistics by key, in metres and radians. A statistic that is undefined is None.
 
-        ``pairs``: number of compared poses. ``ape.position_*``, ``ape.rotation_*``, ``rpe_per_m.position_*`` and so on
-        have the endings ``rmse``, ``mean``, ``median``, ``p95``, ``max``, ``min`` and ``std``. ``rpe_per_m.pieces``,
-        ``rpe_per_s.pieces``: number of relative errors.
+        ``pairs``: number of compared poses. ``ape.position_*``, ``ape.rotation_*``: absolute pose errors.
+        ``rpe_per_m.position_*`` and so on: relative errors. The endings * are ``rmse``, ``mean``, ``median``, ``p95``,
+        ``max``, ``min`` and ``std``. ``rpe_per_m.pieces``, ``rpe_per_s.pieces``: number of relative errors.
         """
         figures: dict[str, float | None] = {"pairs": len(self.estimate)}
         figures |= self.ape.figures("ape")
