@@ -30,10 +30,14 @@ System = tuple[Array, Array, Array, Array]
 @compiled
 def normal(count: int, first: Integers, jacobian: Array, residual: Array) -> System:
     """Return the normal equations of ``count`` (N) poses and P parameters, from M residuals (M,).
+
     ``first`` (M,): the index of the first pose that each residual depends on. ``jacobian`` (M, 6 + P): the derivatives
-    of the residuals with respect to this pose, the next pose, and the parameters. The four results are blocks of the
-    information matrix. They are each pose with itself (N, 3, 3), with the next pose (N, 3, 3), with the parameters (N,
-    3, P + 1), and the parameters (P + 1, P + 1). The last column of the latter two is the gradient."""
+    of the residuals with respect to this pose, the next pose, and the parameters.
+
+    Returns four blocks of the information matrix. The first two are of each pose (N, 3, 3), and of each pose and the
+    next pose (N, 3, 3). The third is of each pose and the parameters (N, 3, P + 1). The fourth is of the parameters (P
+    + 1, P + 1). The last column of the third and fourth is the gradient.
+    """
     shared = jacobian.shape[1] - 2 * POSE
     own, coupling = np.zeros((count, POSE, POSE)), np.zeros((count, POSE, POSE))
     side, corner = np.zeros((count, POSE, shared + 1)), np.zeros((shared + 1, shared + 1))
@@ -127,8 +131,7 @@ def _eliminated(system: System, damping: float) -> tuple[bool, Array, Array, Arr
 
 @compiled
 def solved(system: System, damping: float) -> tuple[bool, Array, Array]:
-    """Return a damped step from the normal equations ``system`` of :func:`normal`, with their diagonal times ``1 +
-    damping``.
+    """Solve normal equations from :func:`normal` for a step, with their diagonal multiplied by ``1 + damping``.
 
     Returns three values: True if the poses are determined, the step of the poses (N, 3), and the step of the parameters
     (P,). The steps are zero if the first value is False. Raises LinAlgError if the parameters are not determined.

@@ -88,8 +88,7 @@ def is_place(key: int) -> bool:
 
 
 def is_of_keyframe(key: int) -> bool:
-    """True if ``key`` is the key of a pose, or of roll and pitch. A fixed-lag smoother removes these with a
-    keyframe."""
+    """True for the key of a pose, or of roll and pitch. A fixed-lag smoother removes these with their keyframe."""
     return key >> _CHARACTER in (_POSE, _TILT)
 
 
@@ -221,7 +220,7 @@ class PriorFactor:
         return self._whitener @ error, [self._whitener @ se2.inverse_right_jacobian(error)]
 
     def cost(self, values: Sequence[Array]) -> float:
-        """Return half the squared norm of the whitened residual at the pose."""
+        """Return half the squared norm of the whitened residual at the pose. ``values``: a list of the pose (3,)."""
         error = self._whitener @ se2.log(se2.between(self._mean, values[0]))
         return 0.5 * float(error @ error)
 
@@ -235,8 +234,8 @@ class VectorPriorFactor:
         self._whitener = np.diag(1.0 / uncertainty) if uncertainty.ndim == 1 else positive.whitener(uncertainty)
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Return the whitened residual (P,) and a list of its Jacobian (P, P). ``values``: one vector (P,) in a
-        list."""
+        """Return the whitened residual (P,) and a list of its Jacobian (P, P). ``values``: a list of the vector
+        (P,)."""
         return self._whitener @ (values[0] - self._mean), [self._whitener]
 
     def cost(self, values: Sequence[Array]) -> float:

@@ -39,7 +39,7 @@ def minima(
     moved: Callable[[Array, Array], Array] = np.add,
     largest: Array | float = np.inf,
 ) -> Minima:
-    """Return the local minima of N independent costs, found by Newton-like steps from initial states.
+    """Return the local minima of N independent costs, found by damped Newton steps from initial states.
 
     ``at(states, which)``: returns costs (n,), gradients (n, D) and curvatures (n, D, D) of the costs with indices
     ``which`` (n,). The curvature is the Fisher information or the Gauss-Newton approximation of the Hessian.
@@ -83,7 +83,7 @@ def minimum(
     """Return the state (D,), the cost and the curvature (D, D) at a local minimum of one cost.
 
     ``at(state)``: returns the cost, gradient (D,) and curvature (D, D). ``start`` (D,): initial state. ``iterations``:
-    their maximum number. A step of at most ``converged`` ends the search. A step above ``largest`` is shortened.
+    maximum number of steps. A step of at most ``converged`` ends the search. A step above ``largest`` is shortened.
     ``low``, ``high``: bounds of the state. The last four are scalars or (D,).
     """
 

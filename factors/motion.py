@@ -50,7 +50,8 @@ class ChainState(NamedTuple):
 
 
 def propagate(covariance: Array, increment: Increment) -> Array:
-    """Return the body-frame covariance (3, 3) of a pose after a motion, from the ``covariance`` (3, 3) before it."""
+    """Return the body-frame covariance (3, 3) of a pose after the motion ``increment``, from ``covariance`` before
+    it."""
     return np.asarray(carried(covariance, increment.delta, increment.covariance))
 
 

@@ -71,8 +71,7 @@ def whitener(covariances: Array) -> Array:
 
 
 def root(covariances: Array) -> Array:
-    """Return lower Cholesky factors (..., D, D) of ``covariances``, or of the :func:`nearest` ones if there are
-    none."""
+    """Return lower Cholesky factors (..., D, D) of ``covariances``, or of the :func:`nearest` ones if none exist."""
     try:
         return np.asarray(np.linalg.cholesky(covariances))
     except np.linalg.LinAlgError:

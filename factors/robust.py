@@ -25,7 +25,7 @@ def geman_mcclure_loss(squared: Squared, scale: float) -> Squared:
 
 @register_jitable(inline="always")
 def geman_mcclure_weight(squared: Squared, scale: float) -> Squared:
-    """Return the weights in iteratively reweighted least squares with :func:`geman_mcclure_loss` and its arguments."""
+    """Return the weights in iteratively reweighted least squares for :func:`geman_mcclure_loss` of these arguments."""
     return (1.0 + squared / scale**2) ** -2
 
 
@@ -41,6 +41,6 @@ def huber_loss(squared: Squared, scale: float) -> Squared:
 
 @register_jitable(inline="always")
 def huber_weight(squared: Squared, scale: float) -> Squared:
-    """Return the weights in iteratively reweighted least squares with :func:`huber_loss`, with the same arguments."""
+    """Return the weights in iteratively reweighted least squares for :func:`huber_loss` of the same arguments."""
     weight: Squared = scale / np.maximum(np.sqrt(squared), scale)
     return weight

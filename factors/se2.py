@@ -83,8 +83,7 @@ def exp(xi: Array) -> Array:
 
 
 def log(pose: Array) -> Array:
-    """Return the twist (..., 3) from the origin to ``pose`` in unit time, the inverse of :func:`exp` for absolute
-    headings below pi."""
+    """Return the twist (..., 3) from the origin to ``pose`` in unit time. Inverse of :func:`exp` for |heading| < pi."""
     pose = np.asarray(pose, dtype=float)
     if pose.ndim == 1:
         return np.array(log_scalars(*pose.tolist()))

@@ -31,7 +31,7 @@ NOT_MOVED, NO_SPREAD, EXACT = np.zeros(3), np.zeros((3, 3)), np.empty((0, 3, 3))
 
 @dataclass(frozen=True, slots=True)
 class ReprojectionFactor:
-    """A factor on the robot's pose from K known points in one image, taken at the time of the pose or shortly later.
+    """A factor on the robot's pose from K known points in one image, taken at the time of the pose or later.
 
     ``model``: the camera. ``points`` (K, 3) [m]: world positions. ``pixels`` (K, 2): their measured pixels.
     ``offset`` (3,): the robot's pose at the time of the image in the frame of the estimated pose, from odometry. None
@@ -43,8 +43,8 @@ class ReprojectionFactor:
     if the time offset is estimated.
 
     The methods take ``values``, a list in this order: the pose (3,), the corrections (P,) of the estimated constants if
-    P > 0, and each displacement (3,) [m] in the world. The robot's roll and pitch are unknown errors that all points
-    have in common.
+    P > 0, and each displacement (3,) [m] in the world. All points have the unknown roll and pitch of the robot in
+    common.
     """
 
     model: CameraModel
@@ -101,9 +101,8 @@ class ReprojectionFactor:
         return self.model.tempering * float(loss)
 
     def levelled(self, values: Sequence[Array]) -> tuple[Array, Array]:
-        """Fit roll and pitch to the K pixels of the image. ``values``: pose, constants and displacements, see the
-        class. Returns the whitened residual (K, 2) after the fit, and roll and pitch (2,) in units of their prior
-        sigma."""
+        """Fit roll and pitch to the K pixels of the image. ``values``: pose, constants, displacements, see the class.
+        Returns the whitened residual (K, 2) after the fit, and roll and pitch (2,) in units of their prior sigma."""
         error, (*_, by_tilt) = self.whitened(values)
         roll, pitch, _ = pixel_kernels.tilted(error, np.ascontiguousarray(by_tilt), float(self.model.robust))
         tilt = np.array((roll, pitch))

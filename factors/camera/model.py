@@ -195,8 +195,8 @@ def rays(model: CameraModel, pixels: Array) -> Array:
 
 
 def folded(model: CameraModel) -> Array | None:
-    """Return a pixel (2,) at which the lens model is not invertible, or None. Only a grid of pixels over the image is
-    checked.
+    """Return a pixel (2,) at which the lens model is not invertible, or None if no pixel of a grid over the image is
+    one.
 
     A lens is invertible at a pixel if a direction within the valid radius projects to the pixel, with a positive
     determinant of the lens's Jacobian.
@@ -317,8 +317,7 @@ class TiltScale:
 
     @staticmethod
     def guessed(sigma: float) -> TiltScale:
-        """Return a filter that has not processed any image. ``sigma`` [rad]: a rough guess of the standard
-        deviation."""
+        """Return the filter before the first image. ``sigma`` [rad]: a rough guess of the standard deviation."""
         return TiltScale(sigma, -0.5 * (np.log(SCALES / sigma) / VAGUE) ** 2, np.zeros(len(SCALES)))
 
     def learnt(self, tilt: Array, covariance: Array, prior: float) -> tuple[TiltScale, float]:

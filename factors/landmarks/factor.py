@@ -124,7 +124,7 @@ class BearingRangeFactor:
         return _places(self.estimated)
 
     def cost(self, values: Sequence[Array]) -> float:
-        """Return the sum of robust losses of all landmarks. ``values``: the pose, constants, bias and position of the
+        """Return the sum of robust losses of all landmarks. ``values``: pose, constants, bias and position of the
         class."""
         error, _, slopes = self._linearized(values)
         return float(losses.loss(self.model.packed, error, slopes))
@@ -168,8 +168,7 @@ class BearingRangeFactor:
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Return the whitened residual (K, 2), predicted minus measured, and a list of its Jacobians (K, 2, d), one for
-        each variable, without robust weights. ``values``: the pose (3,), then estimated constants, bias and
-        position."""
+        each variable, without robust weights. ``values``: the pose (3,), then constants, bias and position."""
         return self._linearized(values)[:2]
 
     def _linearized(self, values: Sequence[Array]) -> tuple[Array, list[Array], Array]:
@@ -259,15 +258,15 @@ class BearingRangeFactor:
 @dataclass(frozen=True)
 class ResolvedFactor:
     """A landmark ``factor`` for one Kalman update, with Gaussian measurements in place of ranges that may be too long.
-    ``shift`` (K,): is added to the whitened range residuals. ``root`` (K,): square roots of the measurements'
-    weights."""
+    ``shift`` (K,): is added to the whitened range residuals. ``root`` (K,): the square roots of robust weights."""
 
     factor: BearingRangeFactor
     shift: Array
     root: Array
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Return the whitened residual (K, 2) and a list of its Jacobians (K, 2, d), one for each variable."""
+        """Return the whitened residual (K, 2) and a list of its Jacobians (K, 2, d) by ``values``, those of
+        ``factor``."""
         error, blocks = self.factor.whitened(values)
         error[:, 0] += self.shift
         return self.root[:, None] * error, [self.root[:, None, None] * block for block in blocks]
@@ -310,7 +309,8 @@ def landmark_update(
 
 
 class BearingRangeStack:
-    """Several landmark factors with the same model and estimated constants, linearised together. Landmarks are known.
+    """Several landmark factors with the same model and estimated constants, linearised together. No landmark is
+    estimated.
 
     ``factors``: L factors.
     ``pose_of`` (L,): the index of the pose that each factor depends on.

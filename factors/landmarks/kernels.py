@@ -105,8 +105,7 @@ def linearize_each(model: Array, poses: Array, points: Array, ranges: Array, bea
 
 @compiled
 def _widen(error: Array, jacobian: Array, uu: float, uv: float, vv: float) -> None:
-    """Whiten ``error`` (2,) and ``jacobian`` (2, WIDTH) of a landmark in place, by a covariance [[uu, uv], [uv,
-    vv]]."""
+    """Whiten ``error`` (2,) and ``jacobian`` (2, WIDTH) of a landmark in place, by its covariance uu, uv, vv."""
     # [[p, 0], [r, q]] is the inverse of the lower Cholesky root of the covariance
     p = 1.0 / math.sqrt(uu)
     low = uv * p
@@ -169,8 +168,7 @@ def linearize_all(
     """Linearise L measurements with :func:`linearize`. Together they have K landmarks, one per row of the arrays.
 
     ``model`` (14,): the sensor. ``poses`` (N, 3), ``pose_of`` (L,): poses, and the index of the pose of each
-    measurement. ``changes`` (6,): corrections of the sensor constants. ``ends`` (L,): index after the last row of each
-    measurement.
+    measurement. ``changes`` (6,): corrections of the sensor constants. ``ends`` (L,): the index after its last row.
     ``measured``: points, ranges and bearings, with K rows each.
     ``flags`` (L, 4): True where a measurement has an offset, an offset covariance, a velocity, and point covariances.
     ``offsets`` (L, 3), ``covariances`` (L, 3, 3), ``twists`` (L, 3): the offset, its covariance and the velocity of
@@ -270,8 +268,7 @@ def weighted(
 def predicted(model: Array, packed: Sighting, pose: Array, covariance: Array) -> tuple[Array, Array, Array]:
     """Return three arrays (K,) about the ranges in ``packed``, to detect ranges that are too long. These are the
     whitened errors, their derivatives by the range (:func:`slopes`), and the variances of the predicted ranges divided
-    by the variance of the noise. ``model`` (14,): the sensor. ``pose`` (3,), ``covariance`` (3, 3): the predicted
-    pose."""
+    by the variance of the noise. ``model`` (14,): the sensor. ``pose`` (3,), ``covariance`` (3, 3): the prediction."""
     count = len(packed[0])
     error, jacobian, slope, variances = (
         np.zeros((count, 2)),

@@ -53,7 +53,7 @@ def reweigh(model: Array, error: Array, slopes: Array, weights: Array) -> None:
 @compiled
 def weigh(model: Array, error: Array, jacobian: Array, slopes: Array) -> None:
     """Multiply the whitened residuals ``error`` (K, 2) and their ``jacobian`` (K, 2, D) in place by square roots of
-    weights. The weights are those of :func:`reweigh`, which is called first. ``model``, ``slopes``: as in
+    weights. The weights are those of :func:`reweigh`, which is called first. ``model``, ``slopes``: see
     :func:`loss`."""
     weights = np.empty(len(error))
     reweigh(model, error, slopes, weights)

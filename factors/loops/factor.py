@@ -49,8 +49,8 @@ class LoopFactor:
         return 2 if self.measured is None else 3
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Return the whitened residual (2,) or (3,) with robust weight, and a list of its Jacobians by the poses
-        ``values``."""
+        """Return the whitened residual (2,) or (3,) with robust weight, and a list of its Jacobians by the two poses.
+        ``values``: the later pose (3,) and the earlier pose (3,)."""
         error, by_later, by_earlier = self.whitened(values)
         weight = math.sqrt(geman_mcclure_weight(float(error @ error), self.robust))
         return weight * error, [weight * by_later, weight * by_earlier]

@@ -91,14 +91,14 @@ class OdometryChain:
 
     def add_velocity(self, t: float, v: float, w: float) -> bool:
         """Add an odometry measurement of forward speed [m/s] and turn rate [rad/s], valid from ``t`` until the next
-        measurement. Returns False, and ignores it, if rows of this time were deleted."""
+        measurement. Returns False, and ignores it, if the measurements of that time were deleted."""
         return self._insert(t + self.model.delay, VELOCITY, v, w, 0.0, 0.0)
 
     def add_increment(self, t: float, dx: float, dy: float, dtheta: float, unknown: float = 0.0) -> bool:
         """Add the motion (dx, dy, dtheta) from the previous measurement until ``t``, in the robot frame at its start.
 
         ``unknown`` [s]: the part of this time in which the motion is unknown. A motion with the same ``t`` as an
-        existing one is composed with it. Returns False, and ignores the motion, if rows of this time were deleted.
+        existing one is composed with it. Returns False, and ignores it, if the measurements of that time were deleted.
         """
         move, last = np.array((dx, dy, dtheta), dtype=float), self._count - 1
         while last >= 0 and self._rows[last, 0] == t and self._rows[last, 1] != INCREMENT:
@@ -113,7 +113,7 @@ class OdometryChain:
 
     def add_yaw_rate(self, t: float, w: float) -> bool:
         """Add a gyro measurement of the turn rate ``w`` [rad/s], valid from ``t`` until the next gyro measurement. It
-        replaces the rotation of the wheels. Returns False, and ignores it, if rows of this time were deleted."""
+        replaces the wheels' rotation. Returns False, and ignores it, if the measurements of that time were deleted."""
         return self._insert(t, GYRO, w, 0.0, 0.0, 0.0)
 
     def add_velocities(self, t: Array, v: Array, w: Array) -> int:
@@ -131,8 +131,7 @@ class OdometryChain:
 
     def add_increments(self, t: Array, dx: Array, dy: Array, dtheta: Array, unknown: Array | None = None) -> None:
         """Add N motions (N,), each since the previous measurement, in order of time ``t`` and after all existing
-        measurements. Motions with equal times are composed. ``unknown`` (N,) [s]: the times of unknown motion, None for
-        zeros."""
+        measurements. Motions with equal times are composed. ``unknown`` (N,) [s]: the times of unknown motion."""
         last, moves = composed(t, np.column_stack((dx, dy, dtheta)))
         if not len(last):
             return
@@ -147,7 +146,7 @@ class OdometryChain:
 
     def state(self, t: float) -> ChainState:
         """Return the integrated state at time ``t`` [s]. Before the first measurement the pose is constant, and all
-        time counts in the field ``unknown``. Raises ValueError if the odometry of that time is deleted."""
+        time is added to the field ``unknown``. Raises ValueError if the odometry of that time is deleted."""
         if t < self.begin:
             raise ValueError(f"the odometry at {t:.3f} s was deleted, and is available only from {self.begin:.3f} s on")
         return ChainState(*state_at(self._knots, self._count, t, self._constants))
@@ -161,8 +160,7 @@ class OdometryChain:
     def begin_slip(self, since: float) -> None:
         """Report that the wheels slip since ``since`` [s]. The motion is unknown from then until :meth:`end_slip`.
 
-        Limitation: a measurement that is added afterwards, but is not the newest, makes the time of unknown motion
-        inexact.
+        Limitation: a measurement added afterwards that is not the newest makes the time of unknown motion inexact.
         """
         if not self._constants[SLIPPING] and self._count:
             self._knots[self._count - 1, UNKNOWN] += max(0.0, self._knots[self._count - 1, T] - since)
@@ -383,7 +381,7 @@ def moved_to(
 
 @compiled
 def put_state(state: State, row: Array) -> None:
-    """Write the fields of a :class:`~factors.motion.ChainState` into an array (8,)."""
+    """Write ``state``, the fields of a :class:`~factors.motion.ChainState`, into the array ``row`` (8,)."""
     row[0], row[1], row[2], row[3] = state[0], state[1], state[2], state[3]
     row[4], row[5], row[6], row[7] = state[4], state[5], state[6], state[7]
 

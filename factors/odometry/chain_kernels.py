@@ -67,8 +67,8 @@ def append(
     """Append velocities to the ``count`` existing rows, write their states into ``knots``, and delete old rows.
 
     ``t``, ``v``, ``w`` (N,): times [s], forward velocities [m/s] and turn rates [rad/s]. ``delay`` [s]: is added to the
-    times. ``constants``: the model as an array. ``horizon`` [s]: as in :func:`without_old`. Returns the new count. If
-    the first new row is older than the last existing row, returns -1 and changes nothing.
+    times. ``constants``: the model as an array. ``horizon`` [s]: the age beyond which rows may be deleted. Returns the
+    new count. If the first new row is older than the last existing row, returns -1 and changes nothing.
     """
     if count and t[0] + delay < knots[count - 1, T]:
         return -1
@@ -208,9 +208,8 @@ def _turn_by_gyro(rows: Array, knots: Array, i: int, constants: Array) -> None:
 
 @compiled
 def move(knot: Array, duration: float, lag: float, hold: float, slipping: float, out: Array) -> None:
-    """Write the integrated odometry state ``duration`` [s] after the state ``knot`` into ``out``. Both are arrays
-    (16,): the fields of :class:`~factors.motion.ChainState`, velocity (3), target velocity (3), and two internal
-    values.
+    """Write the odometry state ``duration`` [s] after the state ``knot`` into ``out``. Both are arrays (16,): the
+    fields of :class:`~factors.motion.ChainState`, velocity (3), target velocity (3), and two internal values.
 
     The velocity converges to the target velocity with the time constant ``lag`` [s], for at most ``hold`` [s]. After
     that the pose is constant and the time is added to the field ``unknown`` of ``out``. If ``slipping`` is 1, the whole

@@ -48,12 +48,14 @@ class PositionFactor:
         return np.einsum("nij,nj->ni", whitener, self.errors(poses)), whitener @ jacobian
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Return the whitened residual (1, 2) and a list of its Jacobian (1, 2, 3) by the pose."""
+        """Return the whitened residual (1, 2) and a list of its Jacobian (1, 2, 3). ``values``: a list of the pose
+        (3,)."""
         residual, jacobian = self.linearized(values[0][None])
         return residual, [jacobian]
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Return the whitened residual (2,) with robust weights, and a list of its Jacobian (2, 3) by the pose."""
+        """Return the whitened residual (2,) with robust weights, and a list of its Jacobian (2, 3) by the pose.
+        ``values``: a list of the pose (3,)."""
         residual, (jacobian,) = self.whitened(values)
         weight = np.sqrt(self.weight(residual[0] @ residual[0]))
         return weight * residual[0], [weight * jacobian[0]]

@@ -50,7 +50,7 @@ class TagReadCounts:
     ``offsets`` (K, 3): the robot's pose at each measurement, in the frame of a reference pose.
     ``antennas`` (K,): indices of the antennas in the model. ``rounds`` (K,): numbers of inventory rounds.
     ``hits`` (K, C): the number of rounds that read each of C listed tags. Tags that are not listed were not read.
-    ``odds`` (C,): the prior log-odds that a listed tag is weak, moved or dead, from
+    ``odds`` (C,): the prior log-odds that a listed tag is weak (seldom read), moved or dead, from
     :class:`~factors.rfid.tag_states.TagStates`. The default ``-inf`` means that the tag certainly is as in the map.
     ``elsewhere`` (C,): the tempered log-likelihood of the reads of a tag that is weak, moved or dead. It is relative to
     that of a tag out of reach without reads. The default is that of a dead tag: 0, or ``-inf`` if the tag was read.
@@ -146,8 +146,8 @@ class Score(NamedTuple):
 
     @classmethod
     def of_signals(cls, nll: Array, gradient: Array, information: Array) -> Score:
-        """Return the score of signal strengths or phases with these fields, ``expected`` equal to ``nll``, ``variance``
-        zero."""
+        """Return the score of signal strengths or phases with these fields, ``expected`` = ``nll`` and ``variance`` =
+        0."""
         return cls(nll, gradient, information, nll, np.zeros(len(nll)))
 
 
@@ -319,9 +319,9 @@ class RfidLikelihood:
         return robot_tables(antennas, self.tags.points[:, 2], finest, facings if self.uses_facing else 0)
 
     def by_tag(self, pose: Array, counts: TagReadCounts) -> tuple[Array, Array, Array]:
-        """Return three arrays about the reads of each tag at one robot pose (3,): the tempered negative log-likelihood
-        (T,), its gradient (T, 2) by the tag's world position, and its Fisher information (T, 2, 2). ``counts``: of all
-        tags."""
+        """Return three arrays about the reads of each tag at one robot pose (3,): tempered negative log-likelihood
+        (T,), its gradient (T, 2) by the tag's world position, and its Fisher information (T, 2, 2). ``counts`` lists
+        all tags."""
         arrays, alpha = counts.packed[:4], self.model.tempering
         pose = np.asarray(pose, dtype=float)
         nll, slope, curve = kernels.by_tag(self.packed, pose, self.tags.points, self.tags.normals, *arrays)

@@ -51,8 +51,7 @@ class TagLikelihood(Protocol):
         """The measurement model, with an attribute ``tempering``, the exponent of the likelihood."""
 
     def score(self, poses: Array, reads: Any, /) -> Score:
-        """Return the tempered likelihood of ``reads`` (counts, strengths or phases) at poses (N, 3) with
-        derivatives."""
+        """Return the tempered likelihood of ``reads`` (counts, strengths, phases) at poses (N, 3), with derivatives."""
 
     def log_likelihood(self, poses: Array, reads: Any, /) -> Array:
         """Return the tempered log-likelihood (N,) of ``reads`` at poses (N, 3), without derivatives, for particles."""
@@ -125,8 +124,7 @@ class RfidFactor:
         return self.likelihood.joint_score(values[0], self._parameters(values[1]), self.reads, self.estimated)
 
     def log_likelihood(self, poses: Array, values: Array | None = None) -> Array:
-        """Return the tempered log-likelihood (N,) of poses (N, 3). ``values`` (N, P) or None: parameters of each
-        pose."""
+        """Return the tempered log-likelihood (N,) of poses (N, 3). ``values`` (N, P): their parameters, or None."""
         if values is None:
             return self.likelihood.log_likelihood(poses, self.reads)
         assert isinstance(self.likelihood, RfidLikelihood)
@@ -134,8 +132,8 @@ class RfidFactor:
         return self.likelihood.log_likelihood(poses, self.reads, self._parameters(values))
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Return the residual (4 + P,) and a list of its Jacobians by the variables: by the pose (4 + P, 3) and, if P >
-        0, by the estimated parameters (4 + P, P)."""
+        """Return the residual (4 + P,) and a list of its Jacobians by the pose (4 + P, 3) and, if P > 0, by the
+        estimated parameters (4 + P, P). ``values``: the pose (3,) and, if P > 0, the parameters (P,)."""
         score = self.score(values)
         residual, jacobian = compressed(float(score.nll[0]), score.gradient[0], score.information[0])
         return residual, [jacobian[:, :3], jacobian[:, 3:]] if self.estimated else [jacobian]
@@ -191,7 +189,7 @@ class RfidTagFactor:
     counts: TagReadCounts
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Return the residual (6,), and its Jacobians by the pose (6, 3) and by the tag's position (6, 2)."""
+        """Return the residual (6,), and its Jacobians by ``values``: the pose (6, 3) and the tag's position (6, 2)."""
         nll, gradient, information = self.score(values)
         residual, jacobian = compressed(nll, gradient, information)
         return residual, [jacobian[:, :3], jacobian[:, 3:]]
@@ -202,7 +200,7 @@ class RfidTagFactor:
 
     def score(self, values: Sequence[Array]) -> tuple[float, Array, Array]:
         """Return the tempered negative log-likelihood, its gradient (5,) and its Fisher information (5, 5). Derivatives
-        are by the body-frame perturbation of the pose (3) and by the tag's position in the world (2)."""
+        are by the body-frame perturbation of the pose (3) and the tag's world position (2), the ``values``."""
         tags, counts, alpha = self.likelihood.tags, self.counts, self.likelihood.model.tempering
         point = np.array([(values[1][0], values[1][1], tags.points[self.tag, 2])])
         hits = np.ascontiguousarray(counts.hits[:, self.tag : self.tag + 1])
@@ -245,8 +243,7 @@ def _corrected(
 ) -> tuple[Array, Array, float, int, float, float, float]:
     """Return the seven results of :meth:`RfidFactor.correct`, computed in compiled code: the correction (3 + P,), the
     covariance after it, the normalised innovation squared and its degrees of freedom, the negative log-likelihood of
-    the prediction minus its mean, its variance, and the log-evidence. The first three arguments are those of
-    :func:`_score`."""
+    the prediction minus its mean, its variance, and the log-evidence. First arguments: see :func:`_score`."""
     size = len(covariance)
     nll, gradient, information, expected, variance = _score(tags, phase, strength, pose, values)
     prior_information = inverse(covariance)

@@ -81,8 +81,9 @@ def detection(packed: Packed, z: float, rate: float) -> tuple[float, float, floa
 def mixture(
     odds: float, elsewhere: float, e: float, mean: float, variance: float, none: float, tempering: float
 ) -> tuple[float, float, float, float]:
-    """Return four values about a tag that may be weak, moved or dead. The first is the factor that multiplies the
-    derivatives of ``e``. The other three are the tempered negative log-likelihood, its mean, and its variance.
+    """Return four values about a tag that may be weak (seldom read), moved or dead. The first is the factor that
+    multiplies the derivatives of ``e``. The other three are the tempered negative log-likelihood, its mean, and its
+    variance.
 
     ``odds``: the prior log-odds that the tag is weak, moved or dead. ``elsewhere``: the tempered log-likelihood of its
     reads if it is, minus that of a tag out of reach that is never read. ``e``, ``mean``, ``variance``: the untempered
@@ -105,9 +106,8 @@ def mixture(
 
 @compiled(inline="always")
 def outcome(q: float, hits: int, rounds: int) -> tuple[float, float, float, float, float]:
-    """Return five numbers about ``hits`` reads in ``rounds`` rounds with read probability ``q``. They are the negative
-    log-likelihood, its derivative by q, the Fisher information on q, and its mean and variance over all numbers of
-    reads."""
+    """Return five numbers about ``hits`` reads in ``rounds`` rounds with read probability ``q``: negative
+    log-likelihood, its derivative by q, its Fisher information, and its mean and variance over all numbers of reads."""
     log_q, log_p = math.log(q), math.log1p(-q)
     nll = -(hits * log_q + (rounds - hits) * log_p)
     gradient = -(hits / q - (rounds - hits) / (1.0 - q))
@@ -358,8 +358,7 @@ def predicted(
 ) -> tuple[Integers, Integers, Array, Array]:
     """Return observed and predicted reads at one pose (3,) of the C tags that are near or listed in ``counts``. The
     first array has the indices (C,) of the tags in the map. Three arrays (K, C) have the number of reads, the read
-    probability, and the horizontal distance [m] from the antenna. ``packed``: models before ``parameters`` (Q,) are
-    applied."""
+    probability, and the horizontal distance [m] from the antenna. ``packed``: models without ``parameters`` (Q,)."""
     own, antennas = adjusted(packed, parameters), counts[1]
     offsets = delayed(counts[0], counts[8], own.delay)
     near = near_tags(of_map, counts, pose.copy().reshape(1, 3), reach_of(own, offsets))

@@ -173,7 +173,7 @@ class Places:
 
     @classmethod
     def of(cls, antennas: Antennas, of_map: MapTags, *, uses_facing: bool) -> Places:
-        """Make the likelihood for tags of a map. ``uses_facing``: True if the model depends on the tags' fronts."""
+        """Return the likelihood for tags of a map. ``uses_facing``: True if the model depends on the tags' fronts."""
         order = of_map.cells.order
         points, normals = np.ascontiguousarray(of_map.points[order]), np.ascontiguousarray(of_map.normals[order])
         tables = robot_tables(antennas, points[: 0 if uses_facing else len(points), 2])

@@ -69,7 +69,7 @@ class TagReads:
 
 @dataclass(frozen=True, eq=False)
 class RssiReads(TagReads):
-    """Reads with signal strengths ``rssi`` (R,) [dBm]."""
+    """R reads with signal strengths ``rssi`` (R,) [dBm]."""
 
     rssi: Array
 
@@ -183,8 +183,7 @@ class PhaseLikelihood:
 
     def near(self, pose: Array, reads: PhaseReads) -> PhaseReads:
         """Return the reads of tags within the model's ``max_range`` of a robot at ``pose`` (3,), in groups of
-        ``min_reads`` or more. Call this once per window. A selection for each pose would make a likelihood
-        discontinuous."""
+        ``min_reads`` or more. Call this once per window: a selection for each pose makes a likelihood discontinuous."""
         at = se2.compose(np.asarray(pose, dtype=float), reads.offsets)
         places = self._antennas[reads.antennas]
         points = self.tags.points[reads.tags]
@@ -340,7 +339,7 @@ def _features(
 def _all_features(
     antennas: Array, points: Array, normals: Array, pose: Array, offsets: Array, which: Integers, tags: Integers
 ) -> Array:
-    """Compute :func:`features` in compiled code, with the same result."""
+    """Return the result of :func:`features`, computed in compiled code."""
     out, c0, s0 = np.empty((len(tags), 6)), math.cos(pose[2]), math.sin(pose[2])
     for r in range(len(tags)):
         antenna, point, normal = antennas[which[r]], points[tags[r]], normals[tags[r]]

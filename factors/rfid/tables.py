@@ -73,8 +73,7 @@ def logs_of(packed: Packed) -> Array32:
 
 def make_tables(model: RfidModel, packed: Packed, heights: Array) -> Tables:
     """Return tables of a model for tags at ``heights`` (T,) [m]. There is one for each detection model, pitch of the
-    antenna, and height of tags above the antenna. ``packed``: the model for compiled code. Logistic models need no
-    table."""
+    antenna, and height of tags above it. ``packed``: the model for compiled code. Logistic models need no table."""
     sigmoids = 1.0 / (1.0 + np.exp(-_LOGITS))
     numbers: dict[tuple[int, float, int], int] = {}
     level = np.zeros((len(model.antennas), len(heights)), dtype=np.int64)

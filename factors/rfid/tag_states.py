@@ -79,8 +79,7 @@ def _log(probability: float) -> float:
 
 class TagStates:
     """Bayesian filters that estimate whether each of T tags is as in the map, dead (never read), weak (read less often
-    or at a shorter range) or moved. ``count``: T. ``dead``, ``weak``, ``moved``: the prior probabilities, below 1 in
-    sum.
+    or at a shorter range) or moved. ``count``: T. ``dead``, ``weak``, ``moved``: prior probabilities, below 1 in sum.
 
     Attributes: ``odds`` (T,) are the log-odds that each tag is dead, weak or moved. ``prior`` is the prior value of the
     log-odds. ``hypotheses`` (S, 4) is the result of :func:`hypotheses`. ``last_read`` [s] is the time of the last read.
@@ -164,8 +163,7 @@ class TagStates:
         self._evidence = kept
 
     def _add(self, tags: Integers, evidence: NDArray[np.float32], sign: float) -> None:
-        """Add (``sign`` 1) or remove (``sign`` -1) the ``evidence`` (U, S) of a scan on ``tags`` (U,), as in
-        :meth:`expect`."""
+        """Add (``sign`` 1) or remove (-1) the ``evidence`` (U, S) of a scan on ``tags`` (U,), see :meth:`expect`."""
         if _learn(self._weights, self.odds, tags, evidence, sign):
             self._doubtful = None
         self._raise_prior()
@@ -283,7 +281,7 @@ def _odds(weights: Array) -> float:
 
 @compiled
 def _expected(weights: Array, tags: Integers, evidence: Array) -> Array:
-    """Compute :meth:`TagStates.expect` from the log-probabilities ``weights`` (T, W) of the states of all tags."""
+    """Return the result of :meth:`TagStates.expect`. ``weights`` (T, W): log-probabilities of all tags' states."""
     out, added = np.empty(len(tags)), np.zeros(weights.shape[1] - DEAD)
     for u in range(len(tags)):
         unsurveyed = weights[tags[u], DEAD:]
