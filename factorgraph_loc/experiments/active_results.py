@@ -133,7 +133,7 @@ def differences(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def summary_cells(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
-    """Return the header and the rows of the printed table of :func:`summaries`."""
+    """Return the header and the rows of a table of statistics as text. A row has a world, an estimator and a policy."""
     header = ["world", "policy", "estimator", "runs", "median [m]", "90 % [m]", "failed (95 %)", "claimed wrongly"]
     header += ["error [m]", "[rad]", "time [s]", "planning [ms]"]
     lines = []
@@ -153,7 +153,7 @@ def summary_cells(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
 
 
 def difference_cells(rows: Sequence[Row]) -> tuple[list[str], list[list[str]]]:
-    """Return the header and the rows of the printed table of :func:`differences`."""
+    """Return the header and the rows of a table of differences as text. A row compares two policies."""
     header = ["world", "policies", "estimator", "pairs", "difference [m] (95 %)", "ratio (95 %)"]
     header += ["failed only first / second", "p (McNemar)"]
     lines = []

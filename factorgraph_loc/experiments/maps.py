@@ -111,9 +111,8 @@ class MadeMap:
     draw: Callable[[], Figure]
 
     def write(self, out: Path, *, overwrite: bool = False) -> None:
-        """Write the map to the file ``out``, and its plot next to it. ``overwrite``: whether existing files may be
-        replaced. Raises InputError if they may not, a file cannot be written, or ``out`` has another suffix than
-        :data:`SUFFIX`."""
+        """Write the map to the file ``out``, and its plot next to it. Raises InputError if a file exists and
+        ``overwrite`` is not set. Also raises it if a file cannot be written, or if ``out`` has a wrong suffix."""
         picture = plot_path(out, overwrite=overwrite)
         with writing(out), replacing(picture) as temporary:  # so that either both files are written, or none
             temporary.write_bytes(png_bytes(self.draw()))

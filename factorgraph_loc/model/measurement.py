@@ -133,7 +133,7 @@ class Stream:
 
     def rows(self, offset: float) -> Rows:
         """Return all N rows as one :class:`Rows` object of N measurements. ``offset`` [s] is added to the timestamps.
-        Call this only for streams with ``joins``, such as odometry."""
+        Call this only if ``joins`` is True, as for odometry."""
         return Rows(self.kind, self.t + offset, tuple(np.array(column, dtype=float) for column in self._columns()))
 
     @property

@@ -31,7 +31,7 @@ class CameraFrame:
 
     @property
     def frame(self) -> "CameraFrame":
-        """This object itself. Other measurements of a camera, which have no features, return None."""
+        """This object. The property exists because it is None for measurements of a camera without features."""
         return self
 
     @property

@@ -98,8 +98,8 @@ def tables(scores: pl.DataFrame) -> str:
 
 
 def figure3(scores: pl.DataFrame) -> Any:
-    """Return a figure of repeatability over the amount of change, with a panel for each sequence. Sequences that were
-    made from different photographs by the same changes share a panel, and their scores are averaged."""
+    """Return a figure of repeatability over the amount of change, with a panel for each sequence of images. Sequences
+    that were made from different photographs by the same changes share a panel, and their scores are averaged."""
     panels = _panels(scores)
     names = scores["feature"].unique(maintain_order=True).to_list()
     figure, axes = grid(len(panels), 1, 3.6 * len(panels) + 1.2)

@@ -133,7 +133,7 @@ class MetricComparison:
 
     @property
     def tied(self) -> list[str]:
-        """The variants without a significant difference from the reference, if the test could find a difference."""
+        """The variants without a significant difference from the reference. Empty if none could be significant."""
         return [v for v, p in self.p.items() if self.has_power and p is not None and not self.is_significant(v)]
 
     @property
