@@ -131,7 +131,7 @@ def _eliminated(system: System, damping: float) -> tuple[bool, Array, Array, Arr
 
 @compiled
 def solved(system: System, damping: float) -> tuple[bool, Array, Array]:
-    """Solve normal equations from :func:`normal` for a step, with their diagonal multiplied by ``1 + damping``.
+    """Solve the normal equations ``system`` (:func:`normal`) for a step, with the diagonal times ``1 + damping``.
 
     Returns three values: True if the poses are determined, the step of the poses (N, 3), and the step of the parameters
     (P,). The steps are zero if the first value is False. Raises LinAlgError if the parameters are not determined.

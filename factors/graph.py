@@ -239,7 +239,7 @@ class VectorPriorFactor:
         return self._whitener @ (values[0] - self._mean), [self._whitener]
 
     def cost(self, values: Sequence[Array]) -> float:
-        """Return half the squared norm of the whitened residual at the vector."""
+        """Return half the squared norm of the whitened residual. ``values``: a list of the vector (P,)."""
         return 0.5 * float(np.sum((self._whitener @ (values[0] - self._mean)) ** 2))
 
 
@@ -281,7 +281,7 @@ def retract(key: int, value: Array, step: Array) -> Array:
 
 
 def frame_motions(values: Values) -> tuple[Array, list[int]]:
-    """Return how all variables change when the whole solution moves in the world frame (the gauge freedom).
+    """Return how all variables ``values`` change when the whole solution moves in the world frame (the gauge freedom).
 
     The first result (n, 3) stacks the changes of all variables, in the tangent space of each. Its columns belong to
     shifts in x and y, and a rotation about the origin. The second result has the index after the last row of each

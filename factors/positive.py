@@ -124,12 +124,12 @@ def smoothed(covariance: Array, transition: Array, noise: Array, change: Array, 
 
 
 def worst_sigma(covariances: Array) -> Array:
-    """Return the largest standard deviation (...) of each covariance (..., D, D) over all directions."""
+    """Return the largest standard deviation (...), over all directions, of each of ``covariances`` (..., D, D)."""
     return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(covariances)[..., -1], 0.0)))
 
 
 def draws(covariance: Array, count: int, rng: np.random.Generator) -> Array:
-    """Return ``count`` random samples (count, D) of a zero-mean Gaussian whose covariance (D, D) may be singular."""
+    """Return ``count`` samples (count, D) of a zero-mean Gaussian, drawn by ``rng``. ``covariance`` may be singular."""
     values, vectors = np.linalg.eigh(covariance)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     return np.asarray(rng.standard_normal((count, len(values))) @ root.T)

@@ -25,7 +25,8 @@ def geman_mcclure_loss(squared: Squared, scale: float) -> Squared:
 
 @register_jitable(inline="always")
 def geman_mcclure_weight(squared: Squared, scale: float) -> Squared:
-    """Return the weights in iteratively reweighted least squares for :func:`geman_mcclure_loss` of these arguments."""
+    """Return the weights for ``squared``, the squared norms of whitened residuals, in iteratively reweighted least
+    squares with :func:`geman_mcclure_loss`. ``scale``: a number of standard deviations."""
     return (1.0 + squared / scale**2) ** -2
 
 
@@ -41,6 +42,7 @@ def huber_loss(squared: Squared, scale: float) -> Squared:
 
 @register_jitable(inline="always")
 def huber_weight(squared: Squared, scale: float) -> Squared:
-    """Return the weights in iteratively reweighted least squares for :func:`huber_loss` of the same arguments."""
+    """Return the weights for ``squared``, the squared norms of whitened residuals, in iteratively reweighted least
+    squares with :func:`huber_loss`. ``scale``: a number of standard deviations."""
     weight: Squared = scale / np.maximum(np.sqrt(squared), scale)
     return weight

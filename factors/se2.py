@@ -143,13 +143,13 @@ def align_points(points: Array, targets: Array) -> Array:
 
 
 def body_to_world(pose: Array, covariance: Array) -> Array:
-    """Return the covariance (..., 3, 3) of (x, y, heading) in the world, from that of the body-frame perturbation."""
+    """Return the covariance (..., 3, 3) of (x, y, heading) in the world, from the body-frame one at ``pose``."""
     rotation = _rotation3(np.asarray(pose, dtype=float)[..., 2])
     return rotation @ covariance @ rotation.mT
 
 
 def world_to_body(pose: Array, covariance: Array) -> Array:
-    """Return the covariance (..., 3, 3) of the body-frame perturbation, from that of (x, y, heading) in the world."""
+    """Return the body-frame covariance (..., 3, 3) at ``pose``, from that of (x, y, heading) in the world."""
     rotation = _rotation3(np.asarray(pose, dtype=float)[..., 2])
     return rotation.mT @ covariance @ rotation
 

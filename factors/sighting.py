@@ -67,7 +67,8 @@ class Marginalized:
         return np.einsum("kij,kj->ki", whitener, residual), [whitener @ by_pose]
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Return the whitened residual (K g,) with robust weights, and a list of its Jacobian (K g, 3) by the pose."""
+        """Return the whitened residual (K g,) with robust weights, and a list of its Jacobian (K g, 3) by the pose.
+        ``values``: a list of the pose (3,)."""
         residual, (by_pose,) = self.whitened(values)
         weight = np.sqrt(self.weight(np.einsum("ki,ki->k", residual, residual)))
         return (weight[:, None] * residual).ravel(), [(weight[:, None, None] * by_pose).reshape(-1, 3)]

@@ -253,7 +253,8 @@ def project_planar(
 @compiled(error_model="numpy")
 def linearize(camera: tuple[Lens, Array, Array], pose: Array, points: Array) -> tuple[Array, Array]:
     """Return the pixels (K, 2) of world ``points`` (K, 3) from a level robot at ``pose`` (3,), and their Jacobians (K,
-    2, WIDTH). ``camera``: lens, position (3,) and rotation (3, 3) in the robot frame. See :func:`project_planar`."""
+    2, WIDTH) by pose, tilt, point and camera constants. ``camera``: lens, position (3,) and rotation (3, 3) in the
+    robot frame."""
     pixels, jacobian = np.empty((len(points), 2)), np.empty((len(points), 2, WIDTH))
     level, upright = np.zeros(2), np.eye(3)
     for i in range(len(points)):
@@ -314,8 +315,9 @@ def linearize_one(
     jacobian: Array,
 ) -> float:
     """Linearise the reprojection error of one pixel, as :func:`whiten` does. ``camera``: lens, position, rotation.
-    ``at``: pose, tilt, point and measured pixel. Writes the whitened ``residual`` (2,) and ``jacobian`` (2, WIDTH).
-    Returns the squared norm of the residual without robust weight."""
+    ``at``: pose, tilt, point and measured pixel. ``sigma`` [px]: noise of the pixel. ``robust``: scale of Huber's loss.
+    Writes the whitened ``residual`` (2,) and ``jacobian`` (2, WIDTH). Returns the squared norm of the residual without
+    robust weight."""
     pose, tilt, point, measured = at
     u, v, depth = project_planar(camera, pose, tilt, turned(tilt[0], tilt[1]), point, jacobian)
     residual[0], residual[1] = (u - measured[0]) / sigma, (v - measured[1]) / sigma
@@ -345,12 +347,13 @@ def log_likelihood(
     scale: float,
     tempering: float,
 ) -> Array:
-    """Return the robust, tempered log-likelihood (N,) of one image at N robot poses (N, 3), up to a constant.
+    """Return the robust, tempered log-likelihood (N,) of one image at N robot ``poses`` (N, 3), up to a constant.
 
-    ``points`` (K, 3): world points. ``pixels`` (K, 2): their measured pixels. ``whiteners`` (K, 2, 2): the matrices
-    that whiten the pixel errors. ``tilts`` (K, 2, 2): the Jacobian of the whitened errors by roll and pitch in standard
-    deviations. ``scale``: the scale of Huber's loss. ``tempering``: the exponent. The tilt of each pose is fitted by
-    least squares, without robust weights.
+    ``k``, ``position``, ``rotation``: the lens, and the camera's pose in the robot frame. ``points`` (K, 3): world
+    points. ``pixels`` (K, 2): their measured pixels. ``whiteners`` (K, 2, 2): the matrices that whiten the pixel
+    errors. ``tilts`` (K, 2, 2): the Jacobian of the whitened errors by roll and pitch in standard deviations.
+    ``scale``: the scale of Huber's loss. ``tempering``: the exponent. The tilt of each pose is fitted by least squares,
+    without robust weights.
     """
     place, count = mounting(position, rotation), len(points)
     px, py, c, s = poses[:, 0].copy(), poses[:, 1].copy(), np.cos(poses[:, 2]), np.sin(poses[:, 2])

@@ -134,7 +134,7 @@ class PointPrior:
         return (relative - self.mean) / self.sigma, [by_pose / self.sigma, by_point / self.sigma]
 
     def cost(self, values: Sequence[Array]) -> float:
-        """Return half the squared norm of the whitened residual."""
+        """Return half the squared norm of the whitened residual. ``values``: the robot's pose and the point."""
         residual = (_from_robot(*values) - self.mean) / self.sigma
         return 0.5 * float(residual @ residual)
 

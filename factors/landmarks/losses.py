@@ -40,7 +40,7 @@ def loss(model: Array, error: Array, slopes: Array) -> float:
 def reweigh(model: Array, error: Array, slopes: Array, weights: Array) -> None:
     """Write the weights of K squared residuals for iteratively reweighted least squares into ``weights`` (K,).
     ``error`` (K, 2): the whitened residuals. A range residual changes in place if the range may be late (too long).
-    Weight times error is then the derivative of the loss. ``model``, ``slopes``: as in :func:`loss`."""
+    Weight times error is then the derivative of the loss. ``model``, ``slopes`` (K,): as in :func:`loss`."""
     for k in range(len(error)):
         if slopes[k] > 0.0 and model[LATE] > 0.0:
             late = model[ROBUST], model[LATE], model[LATE + 1], model[LATE + 2]
@@ -53,8 +53,7 @@ def reweigh(model: Array, error: Array, slopes: Array, weights: Array) -> None:
 @compiled
 def weigh(model: Array, error: Array, jacobian: Array, slopes: Array) -> None:
     """Multiply the whitened residuals ``error`` (K, 2) and their ``jacobian`` (K, 2, D) in place by square roots of
-    weights. The weights are those of :func:`reweigh`, which is called first. ``model``, ``slopes``: see
-    :func:`loss`."""
+    weights. The weights are those of :func:`reweigh`, which is called first with ``model`` and ``slopes``."""
     weights = np.empty(len(error))
     reweigh(model, error, slopes, weights)
     for k in range(len(error)):

@@ -90,8 +90,8 @@ class OdometryChain:
         self._noise = np.array(m.noise())
 
     def add_velocity(self, t: float, v: float, w: float) -> bool:
-        """Add an odometry measurement of forward speed [m/s] and turn rate [rad/s], valid from ``t`` until the next
-        measurement. Returns False, and ignores it, if the measurements of that time were deleted."""
+        """Add an odometry measurement of forward speed ``v`` [m/s] and turn rate ``w`` [rad/s], valid from ``t`` until
+        the next measurement. Returns False, and ignores it, if the measurements of that time were deleted."""
         return self._insert(t + self.model.delay, VELOCITY, v, w, 0.0, 0.0)
 
     def add_increment(self, t: float, dx: float, dy: float, dtheta: float, unknown: float = 0.0) -> bool:
@@ -130,8 +130,9 @@ class OdometryChain:
         return len(t)
 
     def add_increments(self, t: Array, dx: Array, dy: Array, dtheta: Array, unknown: Array | None = None) -> None:
-        """Add N motions (N,), each since the previous measurement, in order of time ``t`` and after all existing
-        measurements. Motions with equal times are composed. ``unknown`` (N,) [s]: the times of unknown motion."""
+        """Add N motions (``dx``, ``dy``, ``dtheta``) as :meth:`add_increment` does, each since the previous
+        measurement. All arrays are (N,), in order of time ``t`` and after all existing measurements. Motions with equal
+        times are composed."""
         last, moves = composed(t, np.column_stack((dx, dy, dtheta)))
         if not len(last):
             return
@@ -152,7 +153,7 @@ class OdometryChain:
         return ChainState(*state_at(self._knots, self._count, t, self._constants))
 
     def states(self, t: Array) -> Array:
-        """Return the integrated states (M, 8) at times (M,) [s]. The columns are the fields of :class:`ChainState`."""
+        """Return the integrated states (M, 8) at times ``t`` (M,) [s]. The columns are the fields of ChainState."""
         out = np.empty((len(t), STATE))
         states_at(self._knots, self._count, np.asarray(t, dtype=float), self._constants, out)
         return out
@@ -297,7 +298,8 @@ def state_at(knots: Array, count: int, t: float, constants: Array) -> State:
 
 @compiled
 def twist_at(knots: Array, count: int, constants: Array, t: float) -> tuple[float, float, float]:
-    """Return the robot's mean velocity (:meth:`OdometryChain.twist`). For the arguments see :func:`state_at`."""
+    """Return the robot's mean velocity before ``t``, see :meth:`OdometryChain.twist`. ``knots``: the states at
+    ``count`` odometry rows. ``constants``: the constants of the odometry model as an array."""
     a, b = state_at(knots, count, t - TWIST_TIME, constants), state_at(knots, count, t, constants)
     moved = se2.between_scalars(a[1], a[2], a[3], b[1], b[2], b[3])
     x, y, turned = se2.log_scalars(moved[0], moved[1], moved[2])

@@ -93,12 +93,12 @@ def insert(
     constants: Array,
     horizon: float,
 ) -> int:
-    """Insert one row among the ``count`` existing ``rows``, in order of time and after rows of equal time.
+    """Insert a row at time ``t`` among the ``count`` existing ``rows``, in order of time and after rows of equal time.
 
     ``kind``: :data:`VELOCITY`, :data:`INCREMENT` or :data:`GYRO`. ``a``, ``b``, ``c``: its values, which are (v, w, 0),
     the logarithm of the motion, or (w, 0, 0). ``unknown`` [s]: the time of unknown motion in an increment. The
     integrated states ``knots`` are updated with the model ``constants``. If the new row is the newest, rows more than
-    ``horizon`` [s] older than it are deleted. Returns the new count.
+    ``horizon`` [s] older are deleted. Returns the new count.
     """
     i = count
     if count and t < knots[count - 1, T]:

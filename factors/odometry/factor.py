@@ -191,8 +191,8 @@ def linearize_changed(
 def linearize_as_reported(
     start: Array, end: Array, twist: Array, moving: float, constants: Array, indices: Integers, whitener: Array
 ) -> tuple[Array, Array, Array, Array]:
-    """Return the results of :func:`linearize_changed` with the translation of the residual divided by the estimated
-    scale of distances. It is then in the distance unit of the wheels, like the noise. The arguments are the same."""
+    """Linearise an increment as :func:`linearize_changed` does, with the same arguments. The translation of the
+    residual is divided by the estimated scale of distances. It is then in the wheels' distance unit, like the noise."""
     unit = 1.0 + all_changes(constants, indices)[0]
     as_reported = whitener.copy()
     for i in range(3):
@@ -251,7 +251,8 @@ def cost_of_all(
     indices: Integers,
 ) -> float:
     """Return half the sum of squared residuals of K increments ``steps``. Increment k is between the poses ``first[k]``
-    and ``first[k] + 1`` of ``poses`` (N, 3). ``constants``, ``indices`` (P,): as in :func:`linearize_all`."""
+    and ``first[k] + 1`` of ``poses`` (N, 3). ``constants``, ``indices`` (P,): corrections of the estimated odometry
+    constants, and their indices among all constants."""
     total = 0.0
     for k in range(len(first)):
         delta = steps.deltas[k]

@@ -37,7 +37,7 @@ State = tuple[float, ...]  # a state of the integrated odometry: t, x, y, headin
 
 @compiled
 def relative(noise: Array, start: State, end: State) -> tuple[Array, Array, float, float]:
-    """Return the motion between two states of the integrated odometry, as in
+    """Return the motion between the states ``start`` and ``end`` of the integrated odometry, see
     :func:`factors.odometry.model.relative_motion`.
 
     ``noise``: the noise of the odometry, a :data:`Noise` as an array. The results are the relative pose (3,), its
@@ -72,7 +72,7 @@ def relative(noise: Array, start: State, end: State) -> tuple[Array, Array, floa
 
 @compiled
 def relatives(noise: Array, starts: Array, ends: Array, constants: Array, indices: Integers) -> tuple[Array, Array]:
-    """Return the motions between N pairs of odometry states (N, 8): relative poses (N, 3) and covariances (N, 3, 3).
+    """Return N motions from odometry states ``starts`` to ``ends`` (N, 8), poses (N, 3) and covariances (N, 3, 3).
 
     ``noise``: the noise of the odometry, a :data:`Noise` as an array. ``constants`` (P,), ``indices`` (P,): the motions
     are corrected by these changes of odometry constants, see :func:`recalibrated`.

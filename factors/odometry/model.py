@@ -106,8 +106,8 @@ def slip(model: OdometryModel, increment: Increment, *, use_gyro: bool) -> tuple
     """Return the additional covariance (3, 3) of an increment with slipping wheels, and the negative log-probability of
     a slip during the increment.
 
-    The additional errors are those of an unknown motion along the direction of travel and, without a gyro, of an
-    unknown rotation. Wheels do not slip sideways.
+    The additional errors are those of an unknown motion along the direction of travel and, if ``use_gyro`` is False, of
+    an unknown rotation. Wheels do not slip sideways.
     """
     duration = max(increment.duration, SHORTEST)
     along, heading = model.unknown_distance**2 * duration, 0.0 if use_gyro else model.unknown_rotation**2 * duration

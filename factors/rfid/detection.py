@@ -246,7 +246,7 @@ class RfidLikelihood:
         """Return the indices (U,) of tags, log-likelihoods (U, S) of S possible states of each tag, such as weak or
         moved, and a mask (U,) of the tags that were read.
 
-        ``poses`` (N, 3): possible robot poses. The likelihood is the mean over all poses.
+        ``counts``: the reads. ``poses`` (N, 3): possible robot poses. The likelihood is the mean over all poses.
         ``hypotheses`` (S, 4): the states, from :func:`factors.rfid.tag_states.hypotheses`.
         ``margin`` [m]: tags that are farther than :attr:`reach` plus margin from all poses are left out, unless they
         were read.
@@ -285,7 +285,8 @@ class RfidLikelihood:
         return make_tables(self.model, self.packed, self.tags.points[:, 2])
 
     def work(self, counts: TagReadCounts) -> int:
-        """Return the approximate computing time of :meth:`log_likelihood` per pose, in evaluations of one tag."""
+        """Return the approximate computing time of :meth:`log_likelihood` for ``counts`` per pose, in evaluated
+        tags."""
         if self.model.fixed:
             return PLACED + BY_ANTENNA * len(counts.antennas) * len(self.tags.points)
         return self._unadjusted._places.work(counts.packed)

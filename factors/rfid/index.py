@@ -97,7 +97,8 @@ class MapTags(NamedTuple):
 class NearTags(NamedTuple):
     """The C tags that are near some poses or listed in the reads. ``tags`` (C,): indices in the map, ascending.
     ``points`` (C, 3), ``normals`` (C, 2): positions and unit vectors of the fronts. ``hits`` (K, C): numbers of reads.
-    ``odds``, ``elsewhere`` (C,): as in :class:`~factors.rfid.detection.TagReadCounts`."""
+    ``odds`` (C,): the prior log-odds that a tag is weak, moved or dead. ``elsewhere`` (C,): the log-likelihood of its
+    reads if it is."""
 
     tags: Integers
     points: Array
@@ -183,10 +184,9 @@ def union(first: Integers, second: Integers) -> Integers:
 def listing(
     listed: Integers, hits: Integers, odds: Array, elsewhere: Array, unlisted_odds: float, tags: Integers
 ) -> tuple[Integers, Array, Array]:
-    """Return ``hits`` (K, U), ``odds`` (U,) and ``elsewhere`` (U,) of ``tags`` (U,), fields of a
-    :class:`~factors.rfid.detection.TagReadCounts`. The arguments ``hits`` (K, C), ``odds`` (C,), ``elsewhere`` (C,) are
-    those of the ``listed`` tags (C,). Both arrays of tags are ascending. A tag that is not listed has 0 hits,
-    ``unlisted_odds``, and 0 for elsewhere."""
+    """Return ``hits`` (K, U), ``odds`` (U,) and ``elsewhere`` (U,) of ``tags`` (U,), see :class:`NearTags`. The
+    arguments ``hits`` (K, C), ``odds`` (C,), ``elsewhere`` (C,) are those of the ``listed`` tags (C,). Both arrays of
+    tags are ascending. A tag that is not listed has 0 hits, ``unlisted_odds``, and 0 for elsewhere."""
     new_hits = np.zeros((len(hits), len(tags)), np.int64)
     new_odds, new_elsewhere = np.full(len(tags), unlisted_odds), np.zeros(len(tags))
     i = 0

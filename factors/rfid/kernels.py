@@ -27,9 +27,9 @@ MOST_COLUMNS = 8  # largest number of components of pose and parameters that one
 def tag_logit(
     packed: Packed, antenna: int, p: float, q: float, height: float, c: float
 ) -> tuple[float, float, float, float, float]:
-    """Return the logit of the read probability of a tag at (p, q, height) [m] from the antenna, and its derivatives by
-    p, q, height and c. The axes have the antenna's yaw but no pitch. ``c``: the cosine of the angle between the tag's
-    front and the direction to the antenna."""
+    """Return the logit of the read probability of a tag at (p, q, height) [m] from one ``antenna`` of the models
+    ``packed``. Also returns its derivatives by p, q, height and c. The axes have the antenna's yaw but no pitch. ``c``:
+    the cosine of the angle between the tag's front and the direction to the antenna."""
     cp, sp = packed.antennas[antenna, 5], packed.antennas[antenna, 6]
     m = packed.which[antenna]
     x, z = cp * p + sp * height, cp * height - sp * p
@@ -69,7 +69,7 @@ def of_tag(
 @compiled(inline="always")
 def detection(packed: Packed, z: float, rate: float) -> tuple[float, float, float]:
     """Return the read probability, including false reads, at the logit ``z``. Also returns its derivatives by the logit
-    and by the logarithm of ``rate``, a factor of the probability."""
+    and by the logarithm of ``rate``, a factor of the probability. ``packed``: has the probability of false reads."""
     sigmoid = 1.0 / (1.0 + math.exp(-max(z, NEGLIGIBLE_LOGIT)))
     by_rate = packed.span * rate * sigmoid
     # without false reads, a probability p may be 0 or 1, so that log(p) or log(1 - p) is infinite
@@ -120,7 +120,7 @@ def outcome(q: float, hits: int, rounds: int) -> tuple[float, float, float, floa
 @compiled
 def _unread(packed: Packed, rounds: Integers) -> Array:
     """Return three values for each of K measurements (K, 3): the negative log-likelihood that a tag out of range is not
-    read, and the mean and variance of the negative log-likelihood over all outcomes."""
+    read, and the mean and variance of the negative log-likelihood over all outcomes. ``rounds`` (K,): their rounds."""
     out, q = np.empty((len(rounds), 3)), detection(packed, NEGLIGIBLE_LOGIT, 1.0)[0]
     for k in range(len(rounds)):
         out[k, 0], _, _, out[k, 1], out[k, 2] = outcome(q, 0, rounds[k])
@@ -229,8 +229,9 @@ def scores(
     packed: Packed, of_map: MapTags, counts: Counts, tempering: float, poses: Array, columns: Integers
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Return ``nll`` (N,), ``gradient``, ``information``, ``expected`` (N,) and ``variance`` (N,) of read ``counts`` at
-    poses (N, 3), see :class:`~factors.rfid.detection.Score`. ``packed``: models with parameters applied. ``tempering``:
-    the exponent. ``columns`` (Q,): the component of each parameter in the gradient, -1 if it is not estimated."""
+    poses (N, 3), see :class:`~factors.rfid.detection.Score`. ``packed``: models with parameters applied. ``of_map``:
+    tags. ``tempering``: exponent. ``columns`` (Q,): component of each parameter in the gradient, -1 if not
+    estimated."""
     antennas, rounds, twists = counts[1], counts[2], counts[8]
     offsets = delayed(counts[0], twists, packed.delay)
     count, scans, size = len(poses), len(antennas), 3
@@ -291,9 +292,9 @@ def scores(
 def score(
     packed: Packed, of_map: MapTags, counts: Counts, alpha: float, pose: Array, parameters: Array, estimated: Integers
 ) -> tuple[float, Array, Array, float, float]:
-    """Return five values at one pose (3,): the tempered negative log-likelihood, its gradient (3 + P,), its Fisher
-    information (3 + P, 3 + P), its mean, and its variance. Derivatives are by the pose and the parameters with indices
-    ``estimated`` (P,). ``packed``: models before ``parameters`` (Q,) are applied. ``alpha``: the tempering exponent."""
+    """Return five values of read ``counts`` at one pose (3,): tempered negative log-likelihood, its gradient (3 + P,),
+    its Fisher information (3 + P, 3 + P), its mean, and its variance. Derivatives are by the pose and by parameters
+    with indices ``estimated`` (P,). ``packed``: models without ``parameters`` (Q,). ``alpha``: tempering exponent."""
     columns = np.full(len(parameters), -1, np.int64)
     for i in range(len(estimated)):
         columns[estimated[i]] = 3 + i
@@ -315,7 +316,8 @@ def by_tag(
 ) -> tuple[Array, Array, Array]:
     """Return the untempered negative log-likelihood (T,) of each of T tags that are as in the map, at one pose (3,).
     Also returns its gradient (T, 5) and Fisher information (T, 5, 5) by the pose (3) and the tag's world position (2).
-    ``offsets`` (K, 3), ``antennas``, ``rounds`` (K,), ``hits`` (K, T): the data of K measurements."""
+    ``packed``: the models. ``points`` (T, 3), ``normals`` (T, 2): the tags. ``offsets`` (K, 3), ``antennas``,
+    ``rounds`` (K,), ``hits`` (K, T): the data of K measurements."""
     scans, tags, size = len(antennas), len(points), 5
     nll, gradient, information = np.empty(tags), np.zeros((tags, size)), np.zeros((tags, size, size))
     at, far, by = np.empty((scans, ROW)), _unread(packed, rounds), np.empty((scans, PLACE))
@@ -339,7 +341,8 @@ def probabilities(
     packed: Packed, antennas: Integers, poses: Array, points: Array, normals: Array
 ) -> tuple[Array, Array]:
     """Return two arrays (N, T): the probability, including false reads, that one round of antenna ``antennas[n]`` on a
-    robot at ``poses[n]`` reads each tag, and the horizontal distance [m] from the antenna to the tag."""
+    robot at ``poses[n]`` reads each tag, and the horizontal distance [m] from the antenna to the tag. ``packed``: the
+    models. ``points`` (T, 3), ``normals`` (T, 2): positions and fronts of T tags."""
     none = np.zeros(3)
     p, distance = np.empty((len(poses), len(points))), np.empty((len(poses), len(points)))
     for n in range(len(poses)):

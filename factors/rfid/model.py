@@ -53,7 +53,8 @@ class BeamModel:
     The read probability is ``p0 * sigmoid((r_max - r) / s_r) * exp(-(phi / sigma_phi)^2 / 2) * front``, with the
     distance r [m] and the bearing phi [rad] of the tag. ``front = behind + (1 - behind) * sigmoid((c + 0.25) / 0.15)``
     depends on the cosine c of the angle between the tag's front and the direction to the antenna (0 if unknown).
-    ``behind``: the read probability from behind a tag, divided by that from its front.
+    ``r_max``, ``s_r`` [m], ``sigma_phi`` [rad]: range, width of its edge, and width of the beam. ``behind``: the read
+    probability from behind a tag, divided by that from its front.
     """
 
     p0: float = 0.9
@@ -82,10 +83,9 @@ class BeamModel:
 
 @dataclass(frozen=True)
 class LogisticModel:
-    """A detection model with a logit linear in :data:`FEATURES` up to the distance ``reach`` [m]. ``coefficients``
-    (11,): one for each feature. They depend on the horizontal distance r [m], the height difference z [m], and w, which
-    is 1 - cosine of the bearing. They also depend on c, the cosine of the angle between the tag's front and the
-    direction to the antenna."""
+    """A detection model with a logit linear in :data:`FEATURES` up to the distance ``reach`` [m], with ``coefficients``
+    (11,). The features depend on the horizontal distance r [m], the height difference z [m], and w = 1 - cosine of the
+    bearing. They also depend on c, the cosine of the angle between the tag's front and the direction to the antenna."""
 
     coefficients: Sequence[float]
     reach: float = 8.0
@@ -273,8 +273,8 @@ def _logits(
 def logit(
     kind: int, parameters: Array, shape: NDArray[np.int64], knots: Array, x: float, y: float, z: float, c: float
 ) -> tuple[float, float, float, float, float]:
-    """Return the logit of a tag's read probability at (x, y, z) in the antenna's frame, and its derivatives by x, y, z
-    and c. ``c``: the cosine of the angle between the tag's front and the direction to the antenna."""
+    """Return the logit of the read probability at (x, y, z) in the antenna's frame, and its derivatives by x, y, z, c.
+    ``c``: cosine between tag front and direction to the antenna. The rest: one model of :class:`Packed`."""
     if kind == BEAM:
         return _beam(parameters, x, y, z, c)
     if kind == LOGISTIC:

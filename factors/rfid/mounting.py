@@ -48,7 +48,8 @@ def reach_of(packed: Packed, offsets: Array) -> float:
 def place_measurements(packed: Packed, pose: Array, offsets: Array, antennas: Integers, out: Array) -> float:
     """Write the antenna of each of K measurements into ``out`` (K, 8): position and boresight in the frame of the tags
     (the world, or the robot if the tags are on it), then boresight and position in the frame of ``pose`` (3,).
-    ``offsets`` (K, 3): the robot in the frame of ``pose``. Returns the largest distance [m] of a readable tag."""
+    ``packed``: the models. ``offsets`` (K, 3), ``antennas`` (K,): robot pose in the frame of ``pose``, and antenna.
+    Returns the largest distance [m] of a readable tag."""
     farthest = 0.0
     for k in range(len(antennas)):
         a = packed.antennas[antennas[k]]

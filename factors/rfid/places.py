@@ -138,7 +138,7 @@ def robot_tables(antennas: Antennas, heights: Array, finest: int = 1, facings: i
 
 def miss_table(tables: RobotTables, scan: Scan, tempering: float, reach: float) -> MissTable:
     """Return the log-likelihood that the scan did not read a tag, tabulated over the tag's position in the robot frame.
-    ``tempering``: exponent of the likelihood. ``reach`` [m]: the largest distance in the table."""
+    ``tables``: read probabilities. ``tempering``: exponent of the likelihood. ``reach`` [m]: the largest distance."""
     total: Array32 = np.zeros((tables.missed.shape[1], *tables.missed.shape[3:]), dtype=np.float32)
     if not total.size:
         return MissTable(total, total, tables.cell, reach)

@@ -260,8 +260,8 @@ def _on_robot(offset: Array, x: float, y: float) -> tuple[float, float]:
 
 @compiled
 def phase_scores(problem: PhaseProblem, poses: Array, derivatives: bool) -> tuple[Array, Array, Array]:
-    """Return the tempered negative log-likelihood (N,) of phases at poses (N, 3), its gradient (N, 3) and its Fisher
-    information (N, 3, 3). The last two are empty if ``derivatives`` is False."""
+    """Return the tempered negative log-likelihood (N,) of the phases of ``problem`` at poses (N, 3), its gradient (N,
+    3) and its Fisher information (N, 3, 3). The last two are empty if ``derivatives`` is False."""
     antennas, points, reads, factor = problem
     count, each = len(poses) if derivatives else 0, len(reads.doubled)
     nll, gradient, information = np.zeros(len(poses)), np.zeros((count, 3)), np.zeros((count, 3, 3))
@@ -360,8 +360,8 @@ def _all_features(
 
 @compiled
 def strength_scores(problem: StrengthProblem, poses: Array, derivatives: bool) -> tuple[Array, Array, Array]:
-    """Return the tempered negative log-likelihood (N,) of signal strengths at poses (N, 3), its gradient (N, 3) and its
-    Fisher information (N, 3, 3). The last two are empty if ``derivatives`` is False."""
+    """Return the tempered negative log-likelihood (N,) of signal strengths of ``problem`` at poses (N, 3), its gradient
+    (N, 3) and its Fisher information (N, 3, 3). The last two are empty if ``derivatives`` is False."""
     antennas, points, normals, b, sigma, dof, factor, offsets, which, tags, rssi = problem
     count = len(poses) if derivatives else 0
     nll, gradient, information = np.zeros(len(poses)), np.zeros((count, 3)), np.zeros((count, 3, 3))

@@ -209,8 +209,9 @@ def displaced(
     tempering: float,
     parameters: Array,
 ) -> tuple[Integers, Array, NDArray[np.bool_]]:
-    """Return the indices (U,) of tags, the log-likelihoods (U, S) of their states, and a mask (U,) of the tags that
-    were read. See :meth:`factors.rfid.detection.RfidLikelihood.displaced`."""
+    """Return the results of :meth:`factors.rfid.detection.RfidLikelihood.displaced`, which has most of these arguments:
+    indices (U,), log-likelihoods (U, S) and a mask (U,). ``packed``, ``tables``: models with all parameters zero.
+    ``of_map``: the tags of the map. ``tempering``: exponent of the likelihood."""
     placed = adjusted(packed, parameters)
     measured = delayed(counts[0], counts[8], placed.delay), counts[1], counts[2]
     reach = margin + reach_of(placed, measured[0])

@@ -104,8 +104,8 @@ def mixed(own: float, odds: float, elsewhere: float) -> float:
 
 @compiled
 def tags_of_tables(tables: Tables, near: NearTags) -> Tags:
-    """Return four arrays about C tags, the argument ``tags`` of :func:`weigh_tag`: points (C, 3), normals (C, 2), the
-    numbers (A, C) of the tables of each antenna and tag, and the numbers of reads (K, C)."""
+    """Return four arrays about the C tags ``near``, the argument ``tags`` of :func:`weigh_tag`: points (C, 3), normals
+    (C, 2), the indices (A, C) of the table of each antenna and tag in ``tables``, and the numbers of reads (K, C)."""
     levels = np.empty((len(tables.level), len(near.tags)), np.int64)
     for a in range(len(levels)):
         for u in range(len(near.tags)):
@@ -115,7 +115,8 @@ def tags_of_tables(tables: Tables, near: NearTags) -> Tags:
 
 @compiled
 def mark_near(poses: Array, tags: Tags, reach: float, out: NDArray[np.bool_]) -> None:
-    """Write a mask into ``out`` (T,): True if a tag is within ``reach`` [m] of the bounding box of the poses (N, 3)."""
+    """Write a mask into ``out`` (T,), True for ``tags`` within ``reach`` [m] of the bounding box of ``poses`` (N,
+    3)."""
     points = tags[0]
     low_x = high_x = poses[0, 0]
     low_y = high_y = poses[0, 1]
@@ -201,8 +202,9 @@ def weigh_tag(
 ) -> None:
     """Write the log-likelihood of tag ``t`` at N poses into ``own`` (N,), relative to that of a tag out of reach.
 
-    ``at``, ``models``, ``measured``: as in :func:`place_antennas`. ``tags``: from :func:`tags_of_tables`. ``count``: N.
-    ``matters`` (K,): a mask of measurements to evaluate. ``product``, ``room`` (N,): working memory.
+    ``packed``, ``tables``: models. ``at``, ``models``, ``measured``: as in :func:`place_antennas`. ``tags``: from
+    :func:`tags_of_tables`. ``count``: N. ``matters`` (K,): which measurements to evaluate. ``product``, ``room`` (N,):
+    buffers.
     """
     points, normals, levels, hits = tags
     _, antennas, rounds = measured
