@@ -8,7 +8,8 @@ from factors.se2 import Array
 
 
 def quantile(probability: ArrayLike, dof: ArrayLike) -> Array:
-    """Return the value that a chi-square variable with ``dof`` degrees of freedom exceeds with 1 - ``probability``."""
+    """Return the value that a chi-square variable with ``dof`` degrees of freedom is below with this
+    ``probability``."""
     return np.asarray(scipy.special.chdtri(dof, 1.0 - np.asarray(probability)))
 
 

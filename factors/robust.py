@@ -18,8 +18,8 @@ Squared = TypeVar("Squared", float, Array)
 
 @register_jitable(inline="always")
 def geman_mcclure_loss(squared: Squared, scale: float) -> Squared:
-    """Return the loss of Geman and McClure (1985) for ``squared``, the squared norms of whitened residuals. It is at
-    most ``scale^2 / 2``, so that gross outliers have no influence. ``scale``: a number of standard deviations."""
+    """Return the loss of Geman and McClure (1985) for ``squared``, the squared norms of whitened residuals. Beyond
+    ``scale`` standard deviations it converges to ``scale^2 / 2``. Gross outliers therefore have no influence."""
     return 0.5 * squared / (1.0 + squared / scale**2)
 
 

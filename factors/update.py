@@ -210,7 +210,7 @@ def corrected(
 
 @compiled(error_model="numpy")
 def normalised(residual: Array, jacobian: Array, columns: Integers, covariance: Array) -> Array:
-    """Return the normalised innovation squared (K,) of each of K sightings. ``residual`` (K, g): the whitened
+    """Return the normalised innovation squared (K,) of each of K measured objects. ``residual`` (K, g): the whitened
     residuals. ``jacobian`` (K, g, D): their Jacobian by the components ``columns`` (D,) of the error state.
     ``covariance`` (S, S): the covariance of the error state."""
     size, wide = residual.shape[1], len(columns)

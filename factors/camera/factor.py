@@ -43,8 +43,7 @@ class ReprojectionFactor:
     if the time offset is estimated.
 
     The methods take ``values``, a list in this order: the pose (3,), the corrections (P,) of the estimated constants if
-    P > 0, and each displacement (3,) [m] in the world. All points have the unknown roll and pitch of the robot in
-    common.
+    P > 0, and each displacement (3,) [m] in the world. All points share the robot's unknown roll and pitch.
     """
 
     model: CameraModel

@@ -23,7 +23,7 @@ LINEAR = 0.1  # below this index of :func:`linearity`, x, y, z of a point are ne
 
 def directions(rays: Array) -> tuple[Array, Array]:
     """Return the directions of K rays as unit vectors (K, 3) in the world, and their Jacobian (K, 3, 2) by azimuth and
-    elevation. ``rays`` (K, 6): x, y, z of the start, azimuth, elevation, and inverse depth."""
+    elevation. ``rays`` (K, 6): x, y, z of the ray's start, azimuth, elevation, and inverse depth."""
     azimuth, elevation = rays[:, 3], rays[:, 4]
     ca, sa, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
     by_angles = np.zeros((len(rays), 3, 2))
@@ -43,7 +43,7 @@ def turned(angles: Array) -> Array:
 
 def positions(rays: Array) -> tuple[Array, Array]:
     """Return the world positions (K, 3) of points, and their Jacobian (K, 3, 6) by the rays. ``rays`` (K, 6): x, y, z
-    of the start, azimuth, elevation, and inverse depth of each point. Inverse depths must be positive."""
+    of the ray's start, azimuth, elevation, and inverse depth of each point. Inverse depths must be positive."""
     ahead, by_angles = directions(rays)
     inverse = rays[:, 5]
     jacobian = np.zeros((len(rays), 3, SIZE))
@@ -55,7 +55,7 @@ def positions(rays: Array) -> tuple[Array, Array]:
 
 def linearize(model: CameraModel, position: Array, rotation: Array, rays: Array) -> tuple[Array, Array, Array]:
     """Predict the pixels of K points in a camera at ``position`` (3,) with ``rotation`` (3, 3) in the world. The points
-    are given as ``rays`` (K, 6): x, y, z of the start, azimuth, elevation, inverse depth.
+    are given as ``rays`` (K, 6): x, y, z of the ray's start, azimuth, elevation, inverse depth.
 
     Returns the pixels (K, 2) and their Jacobians by the camera's perturbation (K, 2, 6) and by the rays (K, 2, 6). The
     perturbation is in the camera frame, with rotation before translation. A pixel depends only on the direction from
@@ -110,7 +110,7 @@ def linearity(rays: Array, sigmas: Array, position: Array) -> Array:
     """Return the linearity index (K,) of Civera et al. (section VI), which is small if x, y, z of a point are nearly
     Gaussian.
 
-    ``rays`` (K, 6): x, y, z of the start, azimuth, elevation, and inverse depth of each point. ``sigmas`` (K,):
+    ``rays`` (K, 6): x, y, z of the ray's start, azimuth, elevation, and inverse depth of each point. ``sigmas`` (K,):
     standard deviations of the inverse depths. ``position`` (3,): the camera's position in the world. If the index is
     below :data:`LINEAR`, x, y, z can replace the ray. It is infinite if the inverse depth is not positive.
     """

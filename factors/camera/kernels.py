@@ -122,7 +122,7 @@ def in_camera(
     ``place``: the camera's pose in the robot frame, from :func:`mounting`. ``c``, ``s``: cosine and sine of the robot's
     heading. ``dx``, ``dy``, ``z``: the vector from the robot to the point along the world's axes.
 
-    Returns the vector (x, y, z) from the camera to the point along the robot's axes, then along the camera's axes.
+    Returns the vector (x, y, z) from camera to point twice, first along the robot's axes, then along the camera's axes.
     """
     position, right, down, ahead = place
     ax, ay, az = c * dx + s * dy - position[0], c * dy - s * dx - position[1], z - position[2]

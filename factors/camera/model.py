@@ -195,8 +195,8 @@ def rays(model: CameraModel, pixels: Array) -> Array:
 
 
 def folded(model: CameraModel) -> Array | None:
-    """Return a pixel (2,) at which the lens model is not invertible, or None if no pixel of a grid over the image is
-    one.
+    """Return a pixel (2,) at which the lens model is not invertible, or None. Checks the pixels of a grid over the
+    image.
 
     A lens is invertible at a pixel if a direction within the valid radius projects to the pixel, with a positive
     determinant of the lens's Jacobian.

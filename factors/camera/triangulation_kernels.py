@@ -71,8 +71,8 @@ def triangulated(
 
 @compiled(error_model="numpy")
 def inverse_depths(first: Array, second: Array, position: Array, motion: Array) -> Array:
-    """Return the inverse depths (K,) [1/m] of K points in the first of two images. The depth of a point is that of the
-    point on the first ray that is nearest to the second ray.
+    """Return the inverse depths (K,) [1/m] of K points in the first of two images. A point is assumed where the first
+    ray is nearest to the second ray.
 
     ``first``, ``second`` (K, 3): the viewing rays in each image, vectors along the robot's axes with depth 1 in the
     camera. ``position`` (3,): position of the camera in the robot frame. ``motion`` (3,): the robot's pose at the

@@ -124,7 +124,7 @@ class BearingRangeFactor:
         return _places(self.estimated)
 
     def cost(self, values: Sequence[Array]) -> float:
-        """Return the sum of robust losses of all landmarks. ``values``: pose, constants, bias and position of the
+        """Return the sum of robust losses of all landmarks. ``values``: pose, constants, bias and position, see the
         class."""
         error, _, slopes = self._linearized(values)
         return float(losses.loss(self.model.packed, error, slopes))
@@ -258,15 +258,14 @@ class BearingRangeFactor:
 @dataclass(frozen=True)
 class ResolvedFactor:
     """A landmark ``factor`` for one Kalman update, with Gaussian measurements in place of ranges that may be too long.
-    ``shift`` (K,): is added to the whitened range residuals. ``root`` (K,): the square roots of robust weights."""
+    ``shift`` (K,): is added to the whitened range residuals. ``root`` (K,): square roots of the Gaussians' weights."""
 
     factor: BearingRangeFactor
     shift: Array
     root: Array
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Return the whitened residual (K, 2) and a list of its Jacobians (K, 2, d) by ``values``, those of
-        ``factor``."""
+        """Return the whitened residual (K, 2) and a list of its Jacobians (K, 2, d) by ``values`` of ``factor``."""
         error, blocks = self.factor.whitened(values)
         error[:, 0] += self.shift
         return self.root[:, None] * error, [self.root[:, None, None] * block for block in blocks]

@@ -92,7 +92,7 @@ def linearize(model: Array, pose: Array, changes: Array, packed: Sighting, error
 def linearize_each(model: Array, poses: Array, points: Array, ranges: Array, bearings: Array) -> tuple[Array, Array]:
     """Return the whitened residuals (N, 2) of N landmark measurements, and their Jacobian (N, 2, WIDTH).
     ``poses`` (N, 3), ``points`` (N, 2) or (N, 3), ``ranges`` (N,), ``bearings`` (N,): the pose, the landmark and the
-    values of each measurement. ``model`` (14,): the sensor, as in :func:`linearize`."""
+    values of each measurement. ``model`` (14,): constants of the sensor, as in :func:`linearize`."""
     error, jacobian = np.zeros((len(poses), 2)), np.zeros((len(poses), 2, WIDTH))
     mounted, depth = (model[0], model[1], model[TURN]), model[DEPTH] > 0.0
     noise = model[3], model[RANGE_SIGMA], model[RELATIVE], model[2], model[BEARING_SIGMA]
@@ -168,7 +168,7 @@ def linearize_all(
     """Linearise L measurements with :func:`linearize`. Together they have K landmarks, one per row of the arrays.
 
     ``model`` (14,): the sensor. ``poses`` (N, 3), ``pose_of`` (L,): poses, and the index of the pose of each
-    measurement. ``changes`` (6,): corrections of the sensor constants. ``ends`` (L,): the index after its last row.
+    measurement. ``ends`` (L,): the index after the last row of each. ``changes`` (6,): corrections of sensor constants.
     ``measured``: points, ranges and bearings, with K rows each.
     ``flags`` (L, 4): True where a measurement has an offset, an offset covariance, a velocity, and point covariances.
     ``offsets`` (L, 3), ``covariances`` (L, 3, 3), ``twists`` (L, 3): the offset, its covariance and the velocity of

@@ -97,8 +97,8 @@ class OdometryChain:
     def add_increment(self, t: float, dx: float, dy: float, dtheta: float, unknown: float = 0.0) -> bool:
         """Add the motion (dx, dy, dtheta) from the previous measurement until ``t``, in the robot frame at its start.
 
-        ``unknown`` [s]: the part of this time in which the motion is unknown. A motion with the same ``t`` as an
-        existing one is composed with it. Returns False, and ignores it, if the measurements of that time were deleted.
+        ``unknown`` [s]: how long the motion is unknown in this time. A motion with the same ``t`` as an existing one is
+        composed with it. Returns False, and ignores it, if the measurements of that time were deleted.
         """
         move, last = np.array((dx, dy, dtheta), dtype=float), self._count - 1
         while last >= 0 and self._rows[last, 0] == t and self._rows[last, 1] != INCREMENT:

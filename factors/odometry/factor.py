@@ -118,8 +118,8 @@ class ScaleFreeOdometryFactor(OdometryFactor):
     kind = None  # always linearised alone
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Return the whitened residual (3,) and a list of its Jacobians by each of ``values``. Both are as in
-        :class:`OdometryFactor`, but the translation is divided by the estimated scale of distances."""
+        """Return the whitened residual (3,) and a list of its Jacobians by each of ``values``. The residual is that of
+        :class:`OdometryFactor` with the translation divided by the estimated scale of distances."""
         start, end, *constants = values
         if not constants:
             return super().linearize(values)

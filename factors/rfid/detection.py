@@ -183,7 +183,7 @@ class RfidLikelihood:
         object.__setattr__(self, "_unadjusted", self)
 
     def adjusted(self, parameters: Array) -> RfidLikelihood:
-        """Return the likelihood with other ``parameters`` (Q,). Raises ValueError if their number is wrong."""
+        """Return the likelihood with other calibration ``parameters`` (Q,). Raises ValueError for a wrong number."""
         parameters, out = np.asarray(parameters, dtype=float), copy.copy(self)
         if parameters.shape != self.parameters.shape:
             raise ValueError(
@@ -243,8 +243,8 @@ class RfidLikelihood:
     def displaced(
         self, poses: Array, counts: TagReadCounts, hypotheses: Array, margin: float, parameters: Array, odds: Array
     ) -> tuple[Integers, Array, NDArray[np.bool_]]:
-        """Return the indices (U,) of tags, log-likelihoods (U, S) of S possible states of each tag, such as weak or
-        moved, and a mask (U,) of the tags that were read.
+        """Return three arrays about possible states of tags, such as weak or moved. They are the indices (U,) of the
+        tags, the log-likelihoods (U, S) of S states of each tag, and a mask (U,) of the tags that were read.
 
         ``counts``: the reads. ``poses`` (N, 3): possible robot poses. The likelihood is the mean over all poses.
         ``hypotheses`` (S, 4): the states, from :func:`factors.rfid.tag_states.hypotheses`.

@@ -124,7 +124,8 @@ class RfidFactor:
         return self.likelihood.joint_score(values[0], self._parameters(values[1]), self.reads, self.estimated)
 
     def log_likelihood(self, poses: Array, values: Array | None = None) -> Array:
-        """Return the tempered log-likelihood (N,) of poses (N, 3). ``values`` (N, P): their parameters, or None."""
+        """Return the tempered log-likelihood (N,) of poses (N, 3). ``values`` (N, P): the estimated parameters of each
+        pose. None means the parameters of the likelihood."""
         if values is None:
             return self.likelihood.log_likelihood(poses, self.reads)
         assert isinstance(self.likelihood, RfidLikelihood)
@@ -132,8 +133,8 @@ class RfidFactor:
         return self.likelihood.log_likelihood(poses, self.reads, self._parameters(values))
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Return the residual (4 + P,) and a list of its Jacobians by the pose (4 + P, 3) and, if P > 0, by the
-        estimated parameters (4 + P, P). ``values``: the pose (3,) and, if P > 0, the parameters (P,)."""
+        """Return the residual (4 + P,) and a list of its Jacobians, by the pose (4 + P, 3) and by the estimated
+        parameters (4 + P, P). ``values``: the pose (3,) and the parameters (P,). If P is 0, the latter are left out."""
         score = self.score(values)
         residual, jacobian = compressed(float(score.nll[0]), score.gradient[0], score.information[0])
         return residual, [jacobian[:, :3], jacobian[:, 3:]] if self.estimated else [jacobian]
@@ -200,7 +201,7 @@ class RfidTagFactor:
 
     def score(self, values: Sequence[Array]) -> tuple[float, Array, Array]:
         """Return the tempered negative log-likelihood, its gradient (5,) and its Fisher information (5, 5). Derivatives
-        are by the body-frame perturbation of the pose (3) and the tag's world position (2), the ``values``."""
+        are by ``values``: the body-frame perturbation of the pose (3) and the position of the tag in the world (2)."""
         tags, counts, alpha = self.likelihood.tags, self.counts, self.likelihood.model.tempering
         point = np.array([(values[1][0], values[1][1], tags.points[self.tag, 2])])
         hits = np.ascontiguousarray(counts.hits[:, self.tag : self.tag + 1])

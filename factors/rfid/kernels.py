@@ -106,8 +106,9 @@ def mixture(
 
 @compiled(inline="always")
 def outcome(q: float, hits: int, rounds: int) -> tuple[float, float, float, float, float]:
-    """Return five numbers about ``hits`` reads in ``rounds`` rounds with read probability ``q``: negative
-    log-likelihood, its derivative by q, its Fisher information, and its mean and variance over all numbers of reads."""
+    """Return five numbers about ``hits`` reads in ``rounds`` rounds with read probability ``q``. The first is the
+    negative log-likelihood. The others are its derivative by q, its Fisher information, and its mean and variance over
+    all numbers of reads."""
     log_q, log_p = math.log(q), math.log1p(-q)
     nll = -(hits * log_q + (rounds - hits) * log_p)
     gradient = -(hits / q - (rounds - hits) / (1.0 - q))

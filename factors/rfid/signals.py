@@ -192,7 +192,7 @@ class PhaseLikelihood:
         return nearby.chosen(np.bincount(nearby.groups)[nearby.groups] >= self.model.min_reads)
 
     def problem(self, reads: PhaseReads) -> PhaseProblem:
-        """Return model, map and ``reads`` for compiled code."""
+        """Return the arrays of model, map and ``reads`` as one tuple for compiled code."""
         return PhaseProblem(self._antennas, self.tags.points, reads.ordered, self.model.tempering * self.model.kappa)
 
     def score(self, poses: Array, reads: PhaseReads) -> Score:
@@ -219,7 +219,7 @@ class RssiLikelihood:
         return *arrays, float(m.sigma), float(m.dof), float(m.tempering)
 
     def problem(self, reads: RssiReads) -> StrengthProblem:
-        """Return model, map and ``reads`` for compiled code."""
+        """Return the arrays of model, map and ``reads`` as one tuple for compiled code."""
         return StrengthProblem(*self._arrays, reads.offsets, reads.antennas, reads.tags, reads.rssi)
 
     def score(self, poses: Array, reads: RssiReads) -> Score:

@@ -104,8 +104,8 @@ def mixed(own: float, odds: float, elsewhere: float) -> float:
 
 @compiled
 def tags_of_tables(tables: Tables, near: NearTags) -> Tags:
-    """Return four arrays about the C tags ``near``, the argument ``tags`` of :func:`weigh_tag`: points (C, 3), normals
-    (C, 2), the indices (A, C) of the table of each antenna and tag in ``tables``, and the numbers of reads (K, C)."""
+    """Return the argument ``tags`` of :func:`weigh_tag`, four arrays about the C tags ``near``. They are points (C, 3),
+    normals (C, 2), indices (A, C) of the table of each antenna and tag in ``tables``, and numbers of reads (K, C)."""
     levels = np.empty((len(tables.level), len(near.tags)), np.int64)
     for a in range(len(levels)):
         for u in range(len(near.tags)):
