@@ -234,8 +234,7 @@ class VectorPriorFactor:
         self._whitener = np.diag(1.0 / uncertainty) if uncertainty.ndim == 1 else positive.whitener(uncertainty)
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Return the whitened residual (P,) and a list of its Jacobian (P, P). ``values``: a list of the vector
-        (P,)."""
+        """Return the whitened residual (P,) and a list of its Jacobian (P, P). ``values``: a list of the vector."""
         return self._whitener @ (values[0] - self._mean), [self._whitener]
 
     def cost(self, values: Sequence[Array]) -> float:
@@ -246,8 +245,8 @@ class VectorPriorFactor:
 def _checked(
     factor: Factor, values: Sequence[Array], rows: int, on_failure: Callable[[str], None]
 ) -> tuple[Array, list[Array]]:
-    """Linearise a factor that must have ``rows`` residuals. If the result is not finite or has a wrong shape, call
-    ``on_failure`` with the reason and return zeros."""
+    """Return residual and Jacobians of a factor that must have ``rows`` residuals, at ``values``. If the result is not
+    finite or has a wrong shape, call ``on_failure`` with the reason and return zeros."""
     try:
         residual, blocks = factor.linearize(values)
         # NaN or infinity times zero is NaN, so the product with zeros detects a value that is not finite
@@ -284,8 +283,7 @@ def frame_motions(values: Values) -> tuple[Array, list[int]]:
     """Return how all variables ``values`` change when the whole solution moves in the world frame (the gauge freedom).
 
     The first result (n, 3) stacks the changes of all variables, in the tangent space of each. Its columns belong to
-    shifts in x and y, and a rotation about the origin. The second result has the index after the last row of each
-    variable.
+    shifts in x and y, and a rotation about the origin. The second result has the index after the last row of each.
     """
     parts = []
     for key, value in values.items():
@@ -335,7 +333,7 @@ def _whitened(lower: Array, vector: Array, out: Array) -> float:
 
 @compiled(error_model="numpy")
 def _compressed(nll: float, gradient: Array, information: Array) -> tuple[Array, Array]:
-    """Return the residual and the Jacobian of :func:`compressed`, from contiguous arrays."""
+    """Return the residual and the Jacobian of :func:`compressed`, from the same arguments as contiguous arrays."""
     size, curvature, trace = len(gradient), information.copy(), 0.0
     residual, jacobian = np.empty(size + 1), np.zeros((size + 1, size))
     for i in range(size):

@@ -50,8 +50,8 @@ class ChainState(NamedTuple):
 
 
 def propagate(covariance: Array, increment: Increment) -> Array:
-    """Return the body-frame covariance (3, 3) of a pose after the motion ``increment``, from ``covariance`` before
-    it."""
+    """Return the body-frame covariance (3, 3) of a pose after a motion ``increment``, from the ``covariance``
+    before."""
     return np.asarray(carried(covariance, increment.delta, increment.covariance))
 
 

@@ -136,7 +136,7 @@ def draws(covariance: Array, count: int, rng: np.random.Generator) -> Array:
 
 
 def _whitener(covariances: Array) -> Array:
-    """Compute :func:`whitener` by eigenvalues of correlation matrices. Eigenvalues below :data:`LEAST` are raised."""
+    """Return the result of :func:`whitener`. Eigenvalues of correlation matrices below :data:`LEAST` are raised."""
     sigmas, values, vectors = _parts(covariances)
     return np.asarray(np.swapaxes(vectors / np.sqrt(values)[..., None, :], -1, -2) / sigmas[..., None, :])
 

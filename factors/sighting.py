@@ -54,8 +54,7 @@ class Marginalized:
     covariances: tuple[Array | None, ...]
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Return the whitened residual (K, g) and a list of its Jacobian (K, g, 3). ``values``: one pose (3,) in a
-        list."""
+        """Return the whitened residual (K, g) and a list of its Jacobian (K, g, 3). ``values``: a list of the pose."""
         residual, (by_pose, *by_values) = self.factor.whitened([values[0], *self.values])
         noise = np.eye(residual.shape[1])
         for block, covariance in zip(by_values, self.covariances, strict=True):

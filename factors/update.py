@@ -105,8 +105,8 @@ def _iterated(
     dof: int,
     converged: float,
 ) -> Correction:
-    """Return the result of :func:`update_state`, which has the same arguments except two. ``solve``: solves one
-    linearised update. ``first_solve``: the same without the tempering exponent."""
+    """Return the result of :func:`update_state`, which has the same last arguments. ``solve``: solves one linearised
+    update. ``first_solve``: the same without the tempering exponent."""
     zero = np.zeros(len(covariance))
     # contiguous arrays, because numba would compile `normalised` and `inform` again for other memory layouts
     residual, blocks = map(np.ascontiguousarray, linearize(zero))

@@ -107,7 +107,7 @@ def begin(
 
 
 def linearity(rays: Array, sigmas: Array, position: Array) -> Array:
-    """Return the linearity index (K,) of Civera et al. (section VI), which is small if x, y, z of a point are nearly
+    """Return the linearity index (K,) of Civera et al. (section VI). It is small if x, y, z of a point are nearly
     Gaussian.
 
     ``rays`` (K, 6): x, y, z of the ray's start, azimuth, elevation, and inverse depth of each point. ``sigmas`` (K,):

@@ -252,8 +252,8 @@ def project_planar(
 
 @compiled(error_model="numpy")
 def linearize(camera: tuple[Lens, Array, Array], pose: Array, points: Array) -> tuple[Array, Array]:
-    """Return the pixels (K, 2) of world ``points`` (K, 3) from a level robot at ``pose`` (3,), and their Jacobians (K,
-    2, WIDTH) by pose, tilt, point and camera constants. ``camera``: lens, position (3,) and rotation (3, 3) in the
+    """Return the pixels (K, 2) of world ``points`` (K, 3) from a level robot at ``pose`` (3,). Also returns their
+    Jacobians (K, 2, WIDTH) by pose, tilt, point and camera constants. ``camera``: lens, position and rotation in the
     robot frame."""
     pixels, jacobian = np.empty((len(points), 2)), np.empty((len(points), 2, WIDTH))
     level, upright = np.zeros(2), np.eye(3)
@@ -290,8 +290,7 @@ def whiten(
 
     ``k``, ``position``, ``rotation``: the lens, and the camera's pose in the robot frame.
     ``poses`` (N, 3), ``tilts`` (N, 2) [rad], ``points`` (N, 3): the robot's pose, its roll and pitch, and the world
-    point of each measurement. ``measured`` (N, 2): the measured pixels. ``sigma`` [px]: the standard deviation of each
-    coordinate.
+    point of each measurement. ``measured`` (N, 2): the measured pixels. ``sigma`` [px]: the pixel noise.
     ``robust``: the scale of Huber's loss in standard deviations.
 
     Returns whitened residuals (N, 2) with robust weights, their Jacobian (N, 2, WIDTH), and the squared norms (N,) of

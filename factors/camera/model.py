@@ -195,8 +195,7 @@ def rays(model: CameraModel, pixels: Array) -> Array:
 
 
 def folded(model: CameraModel) -> Array | None:
-    """Return a pixel (2,) at which the lens model is not invertible, or None. Checks the pixels of a grid over the
-    image.
+    """Return a pixel (2,) at which the lens model is not invertible, or None. Checks a grid of pixels over the image.
 
     A lens is invertible at a pixel if a direction within the valid radius projects to the pixel, with a positive
     determinant of the lens's Jacobian.
@@ -260,8 +259,8 @@ def log_likelihood(
 
     ``poses`` (N, 3): robot poses. ``points`` (K, 3): world points. ``pixels`` (K, 2): their measured pixels.
     ``tilts`` (K, 2, 2): the Jacobian of the pixels by roll and pitch, from :func:`by_tilt`.
-    ``covariances`` (K, 2, 2) [px^2]: covariance of each pixel, including the error of an inexact map. None means pixel
-    noise only.
+    ``covariances`` (K, 2, 2) [px^2]: covariance of each pixel, including the error of an inexact map. None: pixel
+    noise.
     """
     if covariances is None:
         whiteners = np.broadcast_to(np.eye(2) / model.sigma, (len(points), 2, 2)).copy()
@@ -364,7 +363,7 @@ def _normalised(log: Array) -> Array:
 
 @compiled(error_model="numpy")
 def _scale(weights: Array) -> float:
-    """Return the weighted geometric mean of :data:`SCALES`. An arithmetic mean would depend mostly on large values."""
+    """Return the geometric mean of :data:`SCALES` with ``weights``. An arithmetic mean would overrate large values."""
     total = 0.0
     for i, scale in enumerate(SCALES):
         total += weights[i] * math.log(scale)

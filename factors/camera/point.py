@@ -77,8 +77,8 @@ class PointFactor:
 
 
 def _linearize_all(factors: Sequence[PointFactor], values: Sequence[Sequence[Array]]) -> tuple[Array, Array, Array]:
-    """Linearise N factors. Returns the robustly weighted residuals (N, 2), their Jacobian (N, 2, WIDTH), and the
-    squared norms (N,) of the unweighted residuals."""
+    """Return the robustly weighted residuals (N, 2) of N factors, their Jacobian (N, 2, WIDTH), and the squared norms
+    (N,) of the unweighted residuals. ``values``: the variables of each factor."""
     first = factors[0]
     model, lens, (_, *constants, _, _) = first.model, first.lens, values[0]
     if constants:
@@ -120,8 +120,8 @@ class PointPrior:
 
     @classmethod
     def of(cls, pose: Array, point: Array, sigma: float) -> PointPrior:
-        """Return the prior of a world ``point`` (3,) with standard deviation ``sigma`` [m], given the robot's ``pose``
-        (3,)."""
+        """Return the prior of a world ``point`` (3,) with standard deviation ``sigma`` [m]. ``pose`` (3,): of the
+        robot."""
         return cls(_from_robot(pose, point), sigma)
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:

@@ -124,7 +124,7 @@ class BearingRangeFactor:
         return _places(self.estimated)
 
     def cost(self, values: Sequence[Array]) -> float:
-        """Return the sum of robust losses of all landmarks. ``values``: pose, constants, bias and position, see the
+        """Return the sum of robust losses of all landmarks. ``values``: pose, constants, bias, position, see the
         class."""
         error, _, slopes = self._linearized(values)
         return float(losses.loss(self.model.packed, error, slopes))
@@ -183,12 +183,12 @@ class BearingRangeFactor:
         return error, blocks, slopes
 
     def _shortened(self, values: Sequence[Array]) -> Array:
-        """Return the ranges (K,) minus the range bias."""
+        """Return the ranges (K,) minus the range bias in ``values``, if it is estimated."""
         return self.ranges - values[1 + bool(self.estimated)][0] if self.biased else self.ranges
 
     def _whitened(self, values: Sequence[Array], bias: float = 0.0) -> tuple[Array, Array]:
-        """Return the whitened residual (K, 2) with ``bias`` [m] added to the range bias. Also returns its Jacobian (K,
-        2, WIDTH) by the pose, the landmark and all sensor constants."""
+        """Return the whitened residual (K, 2) at ``values``, with ``bias`` [m] added to the range bias. Also returns
+        its Jacobian (K, 2, WIDTH) by the pose, the landmark and all sensor constants."""
         packed, changes, count = self.packed, np.zeros(len(PARAMETERS)), len(self.ranges)
         if self.estimated:
             changes[list(self.estimated)] = values[1]
@@ -201,7 +201,7 @@ class BearingRangeFactor:
         return error, jacobian
 
     def _blocks(self, jacobian: Array) -> list[Array]:
-        """Split a Jacobian (K, 2, WIDTH) into the Jacobians (K, 2, d) by each value except the range bias."""
+        """Return the Jacobians (K, 2, d) by each value except the range bias, parts of ``jacobian`` (K, 2, WIDTH)."""
         blocks = [jacobian[..., :POINT]]
         if self.estimated:
             blocks.append(jacobian[..., CONSTANTS:][..., list(self.estimated)])
@@ -308,8 +308,7 @@ def landmark_update(
 
 
 class BearingRangeStack:
-    """Several landmark factors with the same model and estimated constants, linearised together. No landmark is
-    estimated.
+    """Several landmark factors with the same model and estimated constants, linearised together. Landmarks are given.
 
     ``factors``: L factors.
     ``pose_of`` (L,): the index of the pose that each factor depends on.
@@ -358,8 +357,9 @@ class BearingRangeStack:
         return float(losses.loss(self._model, error, slopes))
 
     def _whitened(self, poses: Array, parameters: Array) -> tuple[Array, Array, Array]:
-        """Return the whitened residuals (K, 2) without robust weights, their Jacobian (K, 2, WIDTH), and the
-        derivatives (K,) of :func:`~factors.landmarks.losses.slopes`."""
+        """Return the whitened residuals (K, 2) without robust weights, at ``poses`` (N, 3) and ``parameters`` (P,).
+        Also returns their Jacobian (K, 2, WIDTH), and the derivatives (K,) of
+        :func:`~factors.landmarks.losses.slopes`."""
         changes, count = np.zeros(len(PARAMETERS)), self.rows // 2
         changes[self._estimated] = parameters[self._column : self._column + len(self._estimated)]
         out = np.zeros((count, 2)), np.zeros((count, 2, WIDTH))
@@ -376,8 +376,8 @@ def _places(estimated: tuple[int, ...]) -> Integers:
 
 
 def _raised_inverse(by_point: Array) -> Array:
-    """Invert a whitened Jacobian (2, 2) by a landmark's position. Small singular values are raised first, because the
-    Jacobian of a landmark very close to the sensor is singular."""
+    """Return the inverse of a whitened Jacobian (2, 2) by a landmark's position. Small singular values are raised
+    first, because the Jacobian of a landmark very close to the sensor is singular."""
     rows, values, columns = np.linalg.svd(by_point)
     if values[1] > LEAST_SINGULAR * values[0]:
         return np.asarray(np.linalg.inv(by_point))

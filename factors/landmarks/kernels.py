@@ -120,8 +120,8 @@ def _widen(error: Array, jacobian: Array, uu: float, uv: float, vv: float) -> No
 
 @compiled
 def _carried(jacobian: Array, covariance: Array) -> tuple[float, float, float]:
-    """Propagate a covariance (D, D) by the first D columns J of a Jacobian. Returns the elements (0, 0), (1, 0) and (1,
-    1) of the product ``J covariance J^T``."""
+    """Return the elements (0, 0), (1, 0) and (1, 1) of ``J covariance J^T``, a propagated ``covariance`` (D, D). J has
+    the first D columns of ``jacobian``."""
     a = b = d = 0.0
     for i in range(len(covariance)):
         for j in range(len(covariance)):

@@ -175,7 +175,7 @@ class LateShares:
 
 
 def _rounded(value: float) -> float:
-    """Round to two significant digits, so that models are often equal and can be linearised together."""
+    """Return ``value`` rounded to two significant digits. Equal models can then be linearised together."""
     return float(f"{value:.2g}")
 
 
@@ -184,8 +184,8 @@ def _learnt(
     logs: Array, shares: Array, means: Array, sigmas: Array, errors: Array, slopes: Array, variances: Array
 ) -> Array:
     """Return the normalised log-probabilities (noises, 1 + H) of all hypotheses after K measured ranges.
-    ``logs``: the same before. ``shares``, ``means``, ``sigmas`` (H,): the hypotheses with late (too long) ranges. The
-    other arguments are those of :meth:`LateShares.updated`."""
+    ``logs``: the log-probabilities before the ranges. ``shares``, ``means``, ``sigmas`` (H,): the hypotheses with late
+    (too long) ranges. The other arguments are those of :meth:`LateShares.updated`."""
     out, late = logs.copy(), np.empty(_PARTS)
     for k in range(len(errors)):
         if slopes[k] == 0.0:

@@ -48,8 +48,7 @@ class PositionFactor:
         return np.einsum("nij,nj->ni", whitener, self.errors(poses)), whitener @ jacobian
 
     def whitened(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
-        """Return the whitened residual (1, 2) and a list of its Jacobian (1, 2, 3). ``values``: a list of the pose
-        (3,)."""
+        """Return the whitened residual (1, 2) and a list of its Jacobian (1, 2, 3). ``values``: a list of the pose."""
         residual, jacobian = self.linearized(values[0][None])
         return residual, [jacobian]
 

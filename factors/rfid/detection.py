@@ -146,7 +146,7 @@ class Score(NamedTuple):
 
     @classmethod
     def of_signals(cls, nll: Array, gradient: Array, information: Array) -> Score:
-        """Return the score of signal strengths or phases with these fields, ``expected`` = ``nll`` and ``variance`` =
+        """Return the score of signal strengths or phases with these fields. ``expected`` is ``nll``, ``variance`` is
         0."""
         return cls(nll, gradient, information, nll, np.zeros(len(nll)))
 
@@ -285,8 +285,8 @@ class RfidLikelihood:
         return make_tables(self.model, self.packed, self.tags.points[:, 2])
 
     def work(self, counts: TagReadCounts) -> int:
-        """Return the approximate computing time of :meth:`log_likelihood` for ``counts`` per pose, in evaluated
-        tags."""
+        """Return the approximate computing time per pose of :meth:`log_likelihood`, in evaluations of one tag in
+        ``counts``."""
         if self.model.fixed:
             return PLACED + BY_ANTENNA * len(counts.antennas) * len(self.tags.points)
         return self._unadjusted._places.work(counts.packed)
@@ -321,8 +321,8 @@ class RfidLikelihood:
 
     def by_tag(self, pose: Array, counts: TagReadCounts) -> tuple[Array, Array, Array]:
         """Return three arrays about the reads of each tag at one robot pose (3,): tempered negative log-likelihood
-        (T,), its gradient (T, 2) by the tag's world position, and its Fisher information (T, 2, 2). ``counts`` lists
-        all tags."""
+        (T,), its gradient (T, 2) by the tag's world position, and its Fisher information (T, 2, 2). ``counts``: all
+        tags listed."""
         arrays, alpha = counts.packed[:4], self.model.tempering
         pose = np.asarray(pose, dtype=float)
         nll, slope, curve = kernels.by_tag(self.packed, pose, self.tags.points, self.tags.normals, *arrays)

@@ -242,9 +242,10 @@ def _corrected(
     covariance: Array,
     iterations: int,
 ) -> tuple[Array, Array, float, int, float, float, float]:
-    """Return the seven results of :meth:`RfidFactor.correct`, computed in compiled code: the correction (3 + P,), the
-    covariance after it, the normalised innovation squared and its degrees of freedom, the negative log-likelihood of
-    the prediction minus its mean, its variance, and the log-evidence. First arguments: see :func:`_score`."""
+    """Return the seven results of :meth:`RfidFactor.correct`, computed in compiled code. They are the correction (3 +
+    P,), the covariance after it, the normalised innovation squared and its degrees of freedom, the negative
+    log-likelihood of the prediction minus its mean, its variance, and the log-evidence. ``tags`` to ``strength``: see
+    :func:`_score`."""
     size = len(covariance)
     nll, gradient, information, expected, variance = _score(tags, phase, strength, pose, values)
     prior_information = inverse(covariance)
@@ -313,7 +314,8 @@ def _scoring_step(prior_information: Array, information: Array, gradient: Array,
 
 @compiled
 def _posterior(prior_information: Array, information: Array) -> tuple[Array, float]:
-    """Return the covariance (D, D) after adding ``information`` to the prior, and the change of its log determinant."""
+    """Return the covariance (D, D) after ``information`` is added to that of the prior, and its change of log
+    determinant."""
     size, both = len(information), prior_information.copy()
     for i in range(size):
         for j in range(size):

@@ -81,9 +81,8 @@ def detection(packed: Packed, z: float, rate: float) -> tuple[float, float, floa
 def mixture(
     odds: float, elsewhere: float, e: float, mean: float, variance: float, none: float, tempering: float
 ) -> tuple[float, float, float, float]:
-    """Return four values about a tag that may be weak (seldom read), moved or dead. The first is the factor that
-    multiplies the derivatives of ``e``. The other three are the tempered negative log-likelihood, its mean, and its
-    variance.
+    """Return four values about a tag that may be weak (seldom read), moved or dead. The first is a factor to multiply
+    the derivatives of ``e`` by. The others are the tempered negative log-likelihood, its mean, and its variance.
 
     ``odds``: the prior log-odds that the tag is weak, moved or dead. ``elsewhere``: the tempered log-likelihood of its
     reads if it is, minus that of a tag out of reach that is never read. ``e``, ``mean``, ``variance``: the untempered
@@ -231,8 +230,7 @@ def scores(
 ) -> tuple[Array, Array, Array, Array, Array]:
     """Return ``nll`` (N,), ``gradient``, ``information``, ``expected`` (N,) and ``variance`` (N,) of read ``counts`` at
     poses (N, 3), see :class:`~factors.rfid.detection.Score`. ``packed``: models with parameters applied. ``of_map``:
-    tags. ``tempering``: exponent. ``columns`` (Q,): component of each parameter in the gradient, -1 if not
-    estimated."""
+    tags. ``tempering``: exponent. ``columns`` (Q,): gradient component of each parameter, -1 if not estimated."""
     antennas, rounds, twists = counts[1], counts[2], counts[8]
     offsets = delayed(counts[0], twists, packed.delay)
     count, scans, size = len(poses), len(antennas), 3

@@ -279,8 +279,8 @@ def _log_likelihood(
 def _of_tag(
     model: Antennas, scan: Scan, x: float, y: float, height: float, nx: float, ny: float, levels: Integers, w: int
 ) -> float:
-    """Return the untempered log-likelihood of one tag that is as in the map, minus that of a tag out of reach that is
-    never read.
+    """Return the untempered log-likelihood of one tag that is as in the map, minus that of a tag never read out of
+    reach.
 
     ``x``, ``y``, ``height``, ``nx``, ``ny``: position and front of the tag in the robot frame. ``levels`` (A,): the
     numbers of the tag's tables. ``w``: the tag's number among the listed tags of the scan, or -1 if it is not listed.
@@ -329,8 +329,9 @@ def _fill(
     gain: Array32,
     missed: Array32,
 ) -> None:
-    """Compute ``gain`` and ``missed`` of :class:`RobotTables` from the tables of the antennas. ``levels`` (A, H): the
-    number of the table of each antenna and height."""
+    """Write ``gain`` and ``missed`` of :class:`RobotTables`, computed from the ``tables`` of the antennas. ``levels``
+    (A, H): the index of the table of each antenna and height. ``heights`` (H,) [m]: heights of tags. ``cell`` [m]: size
+    of a cell."""
     layers, half = gain.shape[2], gain.shape[3] // 2
     for a in range(len(gain)):
         at, m = packed.antennas[a], packed.which[a]

@@ -134,8 +134,8 @@ def logit_row(z: float) -> int:
 
 
 def _planes(packed: Packed, model: int, shape: tuple[int, ...]) -> Array:
-    """Interpolate a grid model at the facings and cells of tables with ``shape`` (F, NX, NX). Returns logits (H, F, NX,
-    NX) at the H heights of the grid."""
+    """Return logits (H, F, NX, NY) of a grid model at its H heights, interpolated at the facings and cells of tables.
+    ``shape``: (F, NX, NX) of the tables. ``model``: the index of the grid model."""
     heights, facings, nx, ny, first = packed.shapes[model].tolist()
     x0, y0, cell = packed.parameters[model, :3]
     grid = packed.knots[first : first + heights * facings * nx * ny].reshape(heights, facings, nx, ny)
@@ -146,7 +146,7 @@ def _planes(packed: Packed, model: int, shape: tuple[int, ...]) -> Array:
 
 
 def _fill_level(planes: Array, packed: Packed, model: int, height: float, table: NDArray[np.uint16]) -> None:
-    """Compute a ``table`` of a grid model for an antenna without pitch, like :func:`_fill` but faster. ``planes``: the
+    """Write a ``table`` of a grid model for an antenna without pitch, like :func:`_fill` but faster. ``planes``: the
     result of :func:`_planes`. ``height`` [m]: the tags' height above the antenna."""
     z0, step = packed.parameters[model, 3:5]
     levels, weights = knots.linear(np.array(((height - z0) / step,)), len(planes))
@@ -160,8 +160,8 @@ def _fill_level(planes: Array, packed: Packed, model: int, height: float, table:
 
 @compiled
 def _fill(packed: Packed, antenna: int, height: float, half: int, table: NDArray[np.uint16]) -> None:
-    """Compute a ``table`` of any model, for tags at ``height`` [m] above the antenna. ``half``: the number of cells
-    from the middle of the table to its edge."""
+    """Write a ``table`` of any model, for tags at ``height`` [m] above the antenna. ``half``: the number of cells from
+    the middle of the table to its edge."""
     facings = len(table)
     for f in range(facings):
         c = 2.0 * f / (facings - 1) - 1.0 if facings > 1 else 0.0

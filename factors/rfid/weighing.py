@@ -115,8 +115,7 @@ def tags_of_tables(tables: Tables, near: NearTags) -> Tags:
 
 @compiled
 def mark_near(poses: Array, tags: Tags, reach: float, out: NDArray[np.bool_]) -> None:
-    """Write a mask into ``out`` (T,), True for ``tags`` within ``reach`` [m] of the bounding box of ``poses`` (N,
-    3)."""
+    """Write a mask into ``out`` (T,), True for ``tags`` within ``reach`` [m] of the bounding box of poses (N, 3)."""
     points = tags[0]
     low_x = high_x = poses[0, 0]
     low_y = high_y = poses[0, 1]
@@ -203,7 +202,7 @@ def weigh_tag(
     """Write the log-likelihood of tag ``t`` at N poses into ``own`` (N,), relative to that of a tag out of reach.
 
     ``packed``, ``tables``: models. ``at``, ``models``, ``measured``: as in :func:`place_antennas`. ``tags``: from
-    :func:`tags_of_tables`. ``count``: N. ``matters`` (K,): which measurements to evaluate. ``product``, ``room`` (N,):
+    :func:`tags_of_tables`. ``count``: N. ``matters`` (K,): mask of measurements to use. ``product``, ``room`` (N,):
     buffers.
     """
     points, normals, levels, hits = tags
@@ -245,7 +244,8 @@ def _chances(
     chance: Array,
 ) -> None:
     """Write the sigmoids of the logits of one tag for one antenna at N poses into ``chance`` (N,). ``at`` (4, N): the
-    antenna's poses. ``unit`` (N,): inverse range scales. ``level``: the table. ``point``, ``normal``: of the tag."""
+    antenna's poses. ``unit`` (N,): inverse range scales. ``level``: the index of the table in ``tables``. ``count``: N.
+    ``point``, ``normal``: position and front of the tag."""
     x, y, c, s = at[0], at[1], at[2], at[3]
     tx, ty, height, nx, ny = point[0], point[1], point[2], normal[0], normal[1]
     if packed.kinds[packed.which[antenna]] == LOGISTIC or tables.facings[level] > 1:
