@@ -57,10 +57,10 @@ def write_run(
     - ``final.tum``, ``causal.tum``: trajectories. The latter starts when the robot is localized first.
     - ``estimates.parquet``: a row for each tick (time of an estimate, every 0.1 s) and ``kind`` of trajectory (causal,
       final). ``t_ns``: timestamp. ``x``, ``y`` [m], ``heading`` [rad], and covariances, in the world frame.
-      ``error_position`` [m], ``error_heading`` [rad, absolute], ``nees``: at the nearest timestamp of the reference,
-      null if this timestamp is nearer to another tick. ``update_ms``: the slowest update since the previous tick, null
-      without an update. ``status``, ``doubts_model`` (whether measurements contradict the model of their sensor): of
-      the causal estimate.
+      ``error_position`` [m], ``error_heading`` [rad, absolute], ``nees``: compared with the reference pose that is
+      nearest in time, null if this pose is nearer to another tick. ``update_ms``: the slowest update since the previous
+      tick, null without an update. ``status``, ``doubts_model`` (True if measurements contradict the model of their
+      sensor): those of the causal estimate, also in rows of the final trajectory.
     - ``learnt.json``: ``constants`` by name with ``value`` and ``sigma``; ``landmarks`` by name with ``x``, ``y`` [m]
       and ``covariance`` (xx, xy, yy) [m^2] in the world frame.
     - ``events.csv``: the timestamp ``t_ns``, the time ``t`` [s] since the log's start, and the event.

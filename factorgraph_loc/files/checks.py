@@ -38,7 +38,7 @@ def in_order(
 ) -> Integers:
     """Return the indices (M,) of the rows to use. Of rows with equal timestamps ``t_ns`` (N,), only the last is used.
 
-    ``rows`` (N,): row numbers in the file ``source``. ``rules``: if given, errors name the key that sorts the rows. If
+    ``rows`` (N,): row numbers in the file ``source``. ``rules``: if given, the error names the setting that sorts rows. If
     rows are dropped, a warning is appended to ``warnings``. Raises InputError if a timestamp precedes the previous one.
     """
     _require_order(source, rows, t_ns, rules)

@@ -106,7 +106,9 @@ def read_mapped(
     read = _read_json_lines if path.suffix.lower() in JSON_SUFFIXES else _read_csv
     cells = read(path, mapping, needed)
     if not len(cells.rows):
-        raise InputError(f"{path}: contains no rows{' with the values in where' if mapping.where else ''}")
+        raise InputError(
+            f"{path}: contains no rows{' with the values that the key where requires' if mapping.where else ''}"
+        )
     return cells
 
 

@@ -150,8 +150,8 @@ def check_content(content: dict[str, Any], source: object) -> None:
 def read_json(path: Path) -> Any:
     """Return the content of a JSON file.
 
-    Raises InputError if the file cannot be read, is not JSON, or is nested deeper than :data:`DEEPEST` levels. The
-    file may not contain more than :data:`MOST_ENTRIES` values, NaN, infinity, or a duplicate key.
+    Raises InputError if the file cannot be read, is not JSON, is nested deeper than :data:`DEEPEST` levels, has more
+    than :data:`MOST_ENTRIES` values, or contains NaN, infinity or a duplicate key.
     """
     return parse_json(read_text(path, bounded.SETTINGS), path)
 

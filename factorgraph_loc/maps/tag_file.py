@@ -116,10 +116,8 @@ def read_tag_file(content: dict[str, Any], source: object, folder: Path) -> dict
                 raise bad_field(path, "id", tag.id, "each tag in one place")
             markers[marker] = _marker(path, tag, rotation, position) | {"sigma": settings.sigma}
     if not markers:
-        first = next(iter(alone), "0")
-        raise InputError(
-            f"{source} [markers]: {path.name} has no poses of tags: add the pose of each tag, such as [markers.at.{first}]"
-        )
+        remedy = f"add the pose of each tag to the manifest, such as [markers.at.{next(iter(alone), '0')}]"
+        raise InputError(f"{source} [markers]: {path.name} has no poses of tags: {remedy}")
     return markers
 
 

@@ -152,9 +152,9 @@ class Binding:
 
     ``setup``: rig, map and sensors of the run. ``motion``: the odometry. ``diagnostics``: receives the innovations.
     ``use``: "known" to use the landmarks of the map, "extended" to estimate further landmarks, "unknown" to estimate
-    all landmarks. ``points``: the same choice for image points and for landmarks with range alone or bearing alone.
-    ``calibration``: which constants are estimated: "all", "none", or "particles" for those that may differ between
-    particles. ``name``: the name of the sensor if the rig has several of its type, otherwise "".
+    all landmarks. ``points``: the same choice for image points, and for landmarks of which only range or only bearing
+    is measured. ``calibration``: which constants are estimated: "all", "none", or "particles" for those that can have
+    another value in each particle. ``name``: the name of the sensor if the rig has several of its type, otherwise "".
     """
 
     setup: Setup

@@ -292,7 +292,7 @@ class Innovation:
 
     def gain(self, noise: Array) -> tuple[Array, Array]:
         """Return L and M, two factors of the Kalman gain M.T @ inv(L). L: the Cholesky factor (2K, 2K) of the
-        innovation covariance with ``noise`` (K, 2, 2). M: inv(L) @ carried.T."""
+        innovation covariance with ``noise`` (K, 2, 2). M: inv(L) @ H @ P, with the Jacobian H and the state covariance P."""
         root = self.root(noise)
         return root, np.asarray(solve_triangular(root, self.carried.T, lower=True, check_finite=False))
 

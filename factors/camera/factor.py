@@ -81,8 +81,8 @@ class ReprojectionFactor:
 
     def linearize(self, values: Sequence[Array]) -> tuple[Array, list[Array]]:
         """Return the whitened residual (2K,) of K pixels and its Jacobian (2K, d) by each variable of size d.
-        ``values``: the pose (3,), then the estimated constants and displacements, see the class. Residual and Jacobians
-        include robust weights and tempering. Their noise includes that of the robot's unknown roll and pitch."""
+        ``values``: the pose (3,), then the estimated constants and displacements, see the class. Both are scaled by the
+        robust weights and the root of the tempering exponent. The noise includes the robot's unknown roll and pitch."""
         if self.of_pose_alone:
             residual, jacobian = pixel_kernels.linearized(self.packed(), np.ascontiguousarray(values[0], dtype=float))
             return residual, [jacobian]

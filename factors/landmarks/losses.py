@@ -13,8 +13,8 @@ from factors.se2 import Array, Integers
 
 @compiled
 def slopes(error: Array, jacobian: Array, ranges: Array, bearings: Array, out: Array) -> None:
-    """Write the derivatives of K whitened range residuals by the predicted ranges into ``out`` (K,) [1/m]. The
-    derivative is 0 for a landmark without range, or with a bearing. ``error`` (K, 2), ``jacobian`` (K, 2, WIDTH): the
+    """Write the derivatives of K whitened range residuals by the predicted ranges into ``out`` (K,) [1/m]. Only a
+    landmark with a range and no bearing can be late. For others, 0 is written. ``error`` (K, 2), ``jacobian`` (K, 2, WIDTH): the
     outputs of :func:`factors.landmarks.kernels.linearize`. ``ranges``, ``bearings`` (K,): measured, NaN if missing."""
     for k in range(len(ranges)):
         alone = math.isnan(bearings[k]) and not math.isnan(ranges[k])

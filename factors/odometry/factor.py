@@ -181,8 +181,9 @@ def linearize_changed(
     start: Array, end: Array, twist: Array, moving: float, constants: Array, indices: Integers, whitener: Array
 ) -> tuple[Array, Array, Array, Array]:
     """Linearise an increment between the poses ``start`` and ``end``, corrected for changed odometry constants.
-    ``twist`` (3,): the logarithm of the increment. ``moving`` [s]: its time in motion. ``constants``, ``indices`` (P,):
-    corrections of the constants, and their indices. ``whitener`` and results: as in :func:`linearize`."""
+    ``twist`` (3,): the logarithm of the increment. ``moving`` [s]: its time in motion. ``constants`` (P,): the
+    differences of constants from those of the model. ``indices`` (P,): the indices of these constants in
+    :data:`~factors.odometry.model.PARAMETERS`. ``whitener`` and results: as in :func:`linearize`."""
     delta, by_changes = changed(twist, moving, constants, indices)
     return linearize(start, end, delta, by_changes, whitener)
 

@@ -209,9 +209,8 @@ def displaced(
     tempering: float,
     parameters: Array,
 ) -> tuple[Integers, Array, NDArray[np.bool_]]:
-    """Return the results of :meth:`factors.rfid.detection.RfidLikelihood.displaced`, which has most of these arguments:
-    indices (U,), log-likelihoods (U, S) and a mask (U,). ``packed``, ``tables``: models with all parameters zero.
-    ``of_map``: the tags of the map. ``tempering``: exponent of the likelihood."""
+    """Return the results of :meth:`factors.rfid.detection.RfidLikelihood.displaced`, which describes most arguments.
+    ``packed``, ``tables``: models with all parameters zero. ``tempering``: exponent of the likelihood."""
     placed = adjusted(packed, parameters)
     measured = delayed(counts[0], counts[8], placed.delay), counts[1], counts[2]
     reach = margin + reach_of(placed, measured[0])

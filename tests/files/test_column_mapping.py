@@ -137,7 +137,11 @@ def test_json_lines_of_several_kinds(read):
         ("x,y\n1,2\n3\n", {"columns": {"a": "x"}}, ("a.csv:3", "2 values: x,y")),
         ('x,y\n1,"2\n', {"columns": {"a": "x"}}, ("a.csv:2", "is not CSV")),
         ("// x, y\n1,2\n", {"columns": {"a": "z"}}, ("a.csv:2", "no column 'z', it has x, y")),
-        ("x,y\n1,2\n", {"columns": {"a": "x"}, "where": {"y": "3"}}, ("a.csv", "no rows with the values in where")),
+        (
+            "x,y\n1,2\n",
+            {"columns": {"a": "x"}, "where": {"y": "3"}},
+            ("a.csv", "no rows", "the key where requires"),
+        ),
     ],
 )
 def test_wrong_tables(read, content, mapping, fragments):

@@ -84,7 +84,11 @@ TWO = TAGS.replace("  ]\n", "    { layout: [ {id: 9, size: 0.1} ] },\n  ]\n").re
             "",
             ("tags.yaml: standalone_tags.1.size is 200", "less than or equal to 10"),
         ),
-        (TAGS.partition("tag_b")[0], "", ("has no poses of tags: add the pose of each tag, such as [markers.at.3]",)),
+        (
+            TAGS.partition("tag_b")[0],
+            "",
+            ("has no poses of tags: add", "such as [markers.at.3]"),
+        ),
         ("a: 1\n", "", ("has neither standalone_tags nor tag_bundles",)),
         (TAGS, "size = 2\n", ("size",)),
     ],

@@ -234,7 +234,8 @@ def require_metadata(folder: Path) -> None:
 
 @contextmanager
 def open_bag(path: Path) -> Iterator[Bag]:
-    """Open a bag in this block and yield it. Raises InputError if it is unreadable or ``rosbags`` is not installed."""
+    """Context manager that opens a bag, yields it, and closes it at the end of the ``with`` block. Raises InputError
+    if the bag is unreadable or ``rosbags`` is not installed."""
     if not path.exists():
         raise InputError(f"{path}: does not exist")
     require_metadata(path)

@@ -258,7 +258,8 @@ def with_markers(log: Log, family: MarkerFamily) -> Log:
     if not isinstance(stream, ImageStream) or not len(stream.t):
         raise InputError(f"{log.name}: has no images to detect markers in")
     if "sightings" in log.streams:
-        raise InputError(f"{log.name}: already has sightings: remove them, or [markers] from the manifest")
+        remedy = "remove the table, or [markers] from the manifest"
+        raise InputError(f"{log.name}: has a table of sightings, so markers cannot be detected: {remedy}")
     kept = FeatureCache(cache_folder())
     t: list[float] = []
     names: list[str] = []

@@ -325,7 +325,7 @@ def bind(binding: Binding) -> TagSensor | None:
     signals = [signal for signal in ("rssi", "phase") if signal in sensors]
     if settings is not None and settings.tags and signals:
         raise InputError(
-            f"the sensor {signals[0]} needs antennas on the robot, but the rig has [rfid.tags]: leave it out of --sensors"
+            f"the sensor {signals[0]} needs antennas on the robot, but the robot has tags ([rfid.tags]): leave it out of --sensors"
         )
     for signal in signals:
         if getattr(settings, signal, None) is None:
