@@ -13,6 +13,7 @@ from factorgraph_loc.fusion.registry import estimator_type, settings_of
 from factorgraph_loc.model.belief import Learnt
 from factorgraph_loc.model.diagnostics import Diagnostics
 from factorgraph_loc.sensors.rfid.summary import doubts
+from factorgraph_loc.simulation import preset, simulate
 
 
 def test_order_of_what_is_fed(log, fake):
@@ -80,6 +81,26 @@ def test_rows_of_odometry_may_come_at_once(log, name, start, monkeypatch):
         np.testing.assert_array_equal(one.t, other.t)
         np.testing.assert_array_equal(one.poses, other.poses)
         np.testing.assert_array_equal(one.covariances, other.covariances)
+
+
+@pytest.mark.parametrize(
+    ("name", "prior"),
+    [
+        *((name, "reference") for name in ("ekf", "smoother", "particle_filter")),
+        *((name, "unknown") for name in ("smoother", "particle_filter")),
+    ],
+)
+def test_several_ticks_may_be_processed_at_once(name, prior):
+    world, drive = {"tags": 20, "landmarks": 10}, {"duration": 20.0}
+    log = simulate(preset("office", {"world": world, "drive": drive, "sightings": {"rate": 2.0}}), 3)
+    config = RunConfig(name, {}, ("odometry", "bearing_range", "rfid"), prior=prior, seed=2)
+    together, singly = run(log, config), run(log, config, watch=lambda *_: None)
+    assert len(set(together.status)) > 1 or prior == "reference"
+    assert together.status == singly.status
+    for one, other in ((together, singly), (together.final, singly.final)):
+        np.testing.assert_array_equal(one.t, other.t)
+        np.testing.assert_array_equal(one.poses, other.poses)
+        np.testing.assert_allclose(one.covariances, other.covariances, rtol=1e-12, atol=0.0)
 
 
 def test_what_is_older_than_the_prior(log, fake):
