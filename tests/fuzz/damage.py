@@ -107,7 +107,9 @@ def of_arrays(draw, content, read=np.load, write=lambda out, arrays: np.savez(ou
     arrays = {name: np.asarray(a) for name, a in read(io.BytesIO(content)).items() if not name.startswith("__")}
     name = draw(st.sampled_from(sorted(arrays)))
     old = arrays.pop(name)
-    others = (old[..., None], old.ravel(), old[:0], old[:1], old.T, np.array("x"), np.array([{"a": 1}], dtype=object))
+    flat = old.ravel()
+    parts = (old[:0], old[:1]) if old.ndim else (flat[:0], flat)
+    others = (old[..., None], flat, *parts, old.T, np.array("x"), np.array([{"a": 1}], dtype=object))
     kinds = [old.astype(kind) for kind in ("f4", "i1", "c16", "U8")]
     if (
         new := draw(st.none() | st.sampled_from((*others, *kinds)) | numbers.map(lambda v: np.full(old.shape, v)))
