@@ -182,17 +182,19 @@ class CausalRun:
         self._update_t.append(t)
 
     def _pass(self, ticks: Iterable[float]) -> None:
-        """Record the estimates at ``ticks`` [s]."""
+        """Record the estimates at ``ticks`` [s]. The estimator processes up to ``_joined`` of them by one call."""
         remaining = iter(ticks)
         while some := tuple(islice(remaining, self._joined)):
             self._tick(some)
 
     def _tick(self, ticks: Sequence[float]) -> None:
+        """Record the estimates at ``ticks`` [s] by one call, and report the progress."""
+        with self.guard.computing("the estimate", ticks[0]):
+            recorded = self._record(ticks)
+        for t, e in zip(ticks, recorded, strict=True):
+            with self.guard.computing("the estimate", t):
+                self.estimates.add(t, self.frame.estimate(sound(e)))
         t = ticks[-1]
-        with self.guard.computing("the estimate", t):
-            recorded = [self.frame.estimate(sound(e)) for e in self._record(ticks)]
-        for tick, e in zip(ticks, recorded, strict=True):
-            self.estimates.add(tick, e)
         if self.watch is not None:
             self.watch(t, self.estimator)
         share = (t - self._start) / max(self._last - self._start, 1e-9)

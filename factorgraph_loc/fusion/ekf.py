@@ -229,11 +229,11 @@ class Ekf(Filter):
         doubts_model, doubted = any(s.doubts_model for s in self._sensors.values()), is_doubted(self._sensors.values())
         estimates = []
         for t, (odometry, step, state, world) in zip(ticks, self._predictions(ticks), strict=True):
-            before = Checkpoint(self._state, self._t, self._odometry, len(self._records), len(self._ticks))
+            checkpoint = Checkpoint(self._state, self._t, self._odometry, len(self._records), len(self._ticks))
             self._t, self._odometry, self._state = t, odometry, state
             self._ticks.append(t)
             self._records.append(_Record(t, step, state))
-            self._remember(Taken(Tick(t), before), self._max_delay)
+            self._remember(Taken(Tick(t), checkpoint), self._max_delay)
             estimates.append(PoseEstimate(t, state.pose, world, self._status(doubted=doubted), doubts_model))
         return estimates
 

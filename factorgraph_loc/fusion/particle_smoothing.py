@@ -100,7 +100,7 @@ class BackwardSimulation:
         return _moments(poses, extra)
 
     def _step(self, cloud: Cloud, increment: Increment, later: Cloud) -> tuple[Cloud, Array]:
-        """Return one particle for each of the M later particles ``later``: the state from which it came, drawn at
+        """Return one particle for each of the M later particles ``later``: its previous state, drawn at
         random from ``cloud``. Also return the differences (M, 3) between the motions in between and the odometry.
         ``increment``: the odometry from ``cloud`` to ``later``."""
         smooth, kernel = cloud.density()

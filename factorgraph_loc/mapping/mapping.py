@@ -118,8 +118,8 @@ class Alignment:
     """The alignment of a new map with the map of the log (the given map).
 
     ``pose`` (3,): x, y and angle of the transform from the new map's frame to the given map's frame. ``covariance``
-    (3, 3): of this transform. ``inliers``: the number of landmarks that agree. ``factor``: the number by which the
-    covariances of the new landmarks must be multiplied to fit the differences.
+    (3, 3): of this transform. ``inliers``: the number of landmarks that agree. ``factor``: multiplies the
+    covariances of the new landmarks, so that they fit the differences.
     """
 
     pose: Array
@@ -175,7 +175,7 @@ def make_map(
 
 
 def align_robustly(points: list[LearntPoint], targets: Array, surveys: Array) -> Alignment:
-    """Return the robust alignment of K estimated landmarks with the log's map, in which a minority of positions may be
+    """Return the robust alignment of K estimated landmarks with the log's map. A minority of positions may be
     wrong. ``points``: the estimates. ``targets`` (K, 2), ``surveys`` (K, 2, 2): the positions in the log's map and
     their covariances. K must be at least ``MIN_COMMON``."""
     positions = np.array([p.position for p in points])

@@ -120,7 +120,7 @@ def _common(first: PointMap, second: PointMap) -> Array | None:
 
 def _same(first: PointMap, second: PointMap) -> Integers:
     """Return pairs (M, 2) of an index in ``first`` and an index in ``second`` that denote the same point. The positions
-    of such points agree, and so do their most similar descriptors."""
+    of such points agree, and their most similar descriptors agree."""
     none = np.empty((0, 2), dtype=np.int64)
     if not (len(first.owners) and len(second.owners)):
         return none

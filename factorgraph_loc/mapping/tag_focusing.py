@@ -96,7 +96,7 @@ def _lattice(covariance: Array) -> Array:
 
 def _best(likelihood: PhaseLikelihood, reads: PhaseReads, start: Array, information: Array, offs: Array) -> Array:
     """Return the displacement (2,) of a tag, among ``offs`` (G, 2), that has the largest posterior density.
-    ``likelihood``: of the phases of ``reads``, for the tag at ``start``. ``start`` (2,): the position before the
+    ``likelihood``: that of the phases of ``reads`` for a tag at ``start``. ``start`` (2,): the position before the
     displacement, relative to the mean of the prior. ``information`` (2, 2): the inverse covariance of the prior."""
     poses = np.column_stack((-offs, np.zeros(len(offs))))
     moved = offs + start

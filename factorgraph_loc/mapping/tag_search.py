@@ -140,7 +140,7 @@ def search(model: RfidModel, counts: TagReadCounts, heights: Array, facing: Arra
 
 
 def merged(counts: TagReadCounts, distance: float, angle: float) -> TagReadCounts:
-    """Return read ``counts`` in which consecutive counts of an antenna are summed. A sum begins anew when the robot is
+    """Return read ``counts`` with consecutive counts of an antenna summed. A new sum begins when the robot is
     more than ``distance`` [m] or ``angle`` [rad] from its pose at the first count."""
     group = np.empty(len(counts.antennas), dtype=np.int64)
     first: dict[int, int] = {}

@@ -340,13 +340,13 @@ def predictions(
         delta, delta_noise, duration, still = relative(noise, start, end)
         for i in range(3):
             copy(delta_noise[i], noises[k, i])
-        moving, at, after = duration - still, poses[k], covariances[k]
-        predicted(delta, delta_noise, moving, pose, covariance, constants, indices, first, at, transitions[k], after)
-        world = body_to_world_one(at, after)
+        moving, at, body = duration - still, poses[k], covariances[k]
+        predicted(delta, delta_noise, moving, pose, covariance, constants, indices, first, at, transitions[k], body)
+        world = body_to_world_one(at, body)
         for i in range(3):
             copy(world[i], worlds[k, i])
         put_state(end, states[k])
-        start, pose, covariance = end, at, after
+        start, pose, covariance = end, at, body
 
 
 @compiled

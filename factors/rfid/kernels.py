@@ -193,11 +193,10 @@ def _add_measurement(
     """
     own, by, count = np.empty(MOST_COLUMNS, np.int64), np.zeros((MOST_COLUMNS, OF_READ)), 3
     own[0], own[1], own[2] = 0, 1, 2
-    way = (
-        -1.0 if packed.fixed else 1.0
-    )  # a motion of the robot moves fixed antennas the opposite way in the robot frame
-    by[0, 0] = by[1, 1] = by[2, 2] = way
-    by[2, 0], by[2, 1] = -way * at[7], way * at[6]
+    # a motion of the robot moves fixed antennas in the opposite direction in the robot frame
+    sign = -1.0 if packed.fixed else 1.0
+    by[0, 0] = by[1, 1] = by[2, 2] = sign
+    by[2, 0], by[2, 1] = -sign * at[7], sign * at[6]
     model, turn = 2 * packed.which[antenna], 2 * len(packed.reach)
     for place, local in ((model, 3), (model + 1, 4), (turn, 2), (turn + 1 + antenna, 2)):
         if columns[place] >= 0:

@@ -81,7 +81,7 @@ def corners(shape: tuple[int, ...]) -> Array:
 
 
 def view(homography: Array, shape: tuple[int, ...]) -> ViewChange:
-    """Return the zoom, rotation and tilt by which a ``homography`` (3, 3) changes the first image at its centre.
+    """Return the zoom, rotation and tilt of a ``homography`` (3, 3) at the centre of the first image.
     ``shape``: (height, width, ...) of the first image."""
     (local,) = jacobians(homography, corners(shape).mean(axis=0, keepdims=True))
     left, axes, right = np.linalg.svd(local)
