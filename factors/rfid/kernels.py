@@ -204,9 +204,9 @@ def _add_measurement(
             count += 1
     if columns[-1] >= 0:
         c, s = math.cos(offset[2]), math.sin(offset[2])
-        own[count], by[count, 2] = columns[-1], way * twist[2]
-        by[count, 0] = way * (c * twist[0] - s * twist[1] - twist[2] * (at[7] - offset[1]))
-        by[count, 1] = way * (s * twist[0] + c * twist[1] + twist[2] * (at[6] - offset[0]))
+        own[count], by[count, 2] = columns[-1], sign * twist[2]
+        by[count, 0] = sign * (c * twist[0] - s * twist[1] - twist[2] * (at[7] - offset[1]))
+        by[count, 1] = sign * (s * twist[0] + c * twist[1] + twist[2] * (at[6] - offset[0]))
         count += 1
     for a in range(count):
         row = np.zeros(OF_READ)
